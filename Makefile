@@ -8,7 +8,7 @@ export OMP_NUM_THREADS ?= 1
 # compiled once, and read by the many processes of the tests
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast coverage docs notebooks notebooks-smoke lint types imports check release install clean
+.PHONY: demo test test-fast coverage docs notebooks notebooks-smoke lint types imports check release install install-locked lock clean
 
 install: $(VENV)/installed
 
@@ -20,6 +20,20 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	$(BIN)/python -m compileall -q -j 0 -x '/tests?/' $(VENV)/lib > $(VENV)/compiled.log || true
 	touch $@
+
+# the same of files whose hashes are known; only which build of torch it is, is left to the machine
+install-locked:
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --no-deps --require-hashes -r constraints.lock
+	$(BIN)/python -m pip install --quiet --no-deps -c constraints.txt torch
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
+	touch $(VENV)/installed
+
+# after a change of constraints.txt; 3.11.5: what soupsieve asks for
+lock: install
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --no-deps --generate-hashes --python-version 3.11.5 --no-annotate --no-emit-package torch \
+		--custom-compile-command 'make lock' constraints.txt -o constraints.lock
 
 demo: install
 	$(BIN)/torch-ekm demo --out demo_output

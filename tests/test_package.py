@@ -225,3 +225,42 @@ def test_every_exported_name_exists() -> None:
         module = importlib.import_module(info.name)
         for name in getattr(module, "__all__", ()):
             assert hasattr(module, name), f"{info.name} exports {name}, which does not exist"
+
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_actions_stand_by_their_hashes() -> None:
+    used = [
+        (path.name, line)
+        for path in sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+        for line in re.findall(r"- uses: (.*)", path.read_text(encoding="utf-8"))
+    ]
+    assert len(used) > 10
+    assert [one for one in used if not re.fullmatch(r"[\w/-]+@[0-9a-f]{40}  # v[\d.]+", one[1])] == []
+
+
+def test_hashes_are_those_of_what_is_pinned() -> None:
+    def pinned(name: str) -> dict[str, str]:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        found = re.findall(r"^([\w.-]+)==(\S+)", text, re.MULTILINE)
+        return {re.sub(r"[-_.]+", "-", name).lower(): version for name, version in found}
+
+    constraints = pinned("constraints.txt")
+    assert constraints.pop("torch")  # a machine chooses its build
+    assert pinned("constraints.lock") == constraints
+    blocks = re.split(r"\n(?=\w)", (ROOT / "constraints.lock").read_text(encoding="utf-8"))[1:]
+    assert all(re.search(r"--hash=sha256:[0-9a-f]{64}", block) for block in blocks)
+
+
+def test_licences_of_what_extras_bring_are_named() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    ours = ["test", "docs", "dev", "notebooks"]  # of those who work on it
+    named = [
+        *project["dependencies"],
+        *(one for extra in extras if extra not in ours for one in extras[extra]),
+    ]
+    notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
+    packages = {re.match(r"[\w-]+", one)[0] for one in named} - {"torch_ekm"}  # pyright: ignore
+    assert [one for one in sorted(packages) if not re.search(rf"(?<![\w-]){one}(?![\w-])", notice)] == []

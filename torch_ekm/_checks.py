@@ -72,7 +72,8 @@ def check_fraction(name: str, value: float) -> float:
 
 
 def check_shape(name: str, value: Tensor, shape: Sequence[int], hint: str = "") -> None:
-    """ShapeError, with the hint, if ``value`` has any other shape."""
+    """ShapeError, with the hint, if ``value`` has any other shape, ParameterError if it is no tensor."""
+    check_kind(name, value, Tensor, "a tensor: torch.as_tensor(...)")
     if tuple(value.shape) != tuple(shape):
         raise ShapeError(name, str(tuple(shape)), value.shape, hint)
 

@@ -1,19 +1,110 @@
-"""Files that are whole or not there, and folders with one writer at a time."""
+"""How a stranger's file is read; files that are whole or not there; folders with one writer at a time."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import stat
 import weakref
 from collections.abc import Iterator
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
 from ._extras import require
-from .exceptions import FolderInUseError, OutputError
+from .exceptions import DescriptionError, EKMError, FileFormatError, FolderInUseError, OutputError
 
 LOCK = ".lock"
 """Name of the file that a folder's writer holds; it stays, empty."""
+
+Refusal = type[DescriptionError] | type[FileFormatError]
+_UNASKED = 64 << 20  # bytes that any file may unpack to
+
+
+def check_file(path: str | os.PathLike, what: str, largest: int, refusal: Refusal = DescriptionError) -> Path:
+    """The path of a regular file of at most ``largest`` bytes: nothing else can be read without waiting.
+
+    Raises:
+        refusal: there is no such file, it is larger, or a folder, a pipe or a device.
+    """
+    path = Path(path)
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError, ValueError):  # a name that no file can have
+        raise refusal(path, f"no such {what}") from None
+    except OSError as error:
+        raise refusal(path, f"cannot be read: {error.strerror}") from None
+    if not stat.S_ISREG(status.st_mode):
+        raise refusal(path, f"no {what}: it is no file but a folder, a pipe or a device")
+    if status.st_size > largest:
+        raise refusal(path, f"a {what} has at most {largest} bytes, this one is larger")
+    return path
+
+
+@contextlib.contextmanager
+def opened(
+    path: str | os.PathLike, what: str, largest: int, refusal: Refusal = DescriptionError
+) -> Iterator[BufferedReader]:
+    """A file to be read, see :func:`check_file`.
+
+    Raises:
+        refusal: as there, or the system refuses.
+    """
+    try:
+        with check_file(path, what, largest, refusal).open("rb") as file:
+            yield file
+    except OSError as error:
+        raise refusal(path, f"cannot be read: {error.strerror or error}") from None
+
+
+def read_file(path: str | os.PathLike, what: str, largest: int) -> bytes:
+    """All bytes of a file, see :func:`opened`.
+
+    Raises:
+        DescriptionError: as there.
+    """
+    with opened(path, what, largest) as file:
+        content = file.read(largest + 1)  # it may have grown, or be one whose size nobody knows
+    if len(content) > largest:
+        raise DescriptionError(path, f"a {what} has at most {largest} bytes, this one is larger")
+    return content
+
+
+@contextlib.contextmanager
+def told_as_damage(path: str | os.PathLike, what: str, refusal: Refusal = DescriptionError) -> Iterator[None]:
+    """Whatever a damaged file makes its library raise is one error; a file can be made to look right.
+
+    Raises:
+        refusal: something was raised that is no error of torch_ekm.
+    """
+    try:
+        yield
+    except EKMError:
+        raise
+    except Exception as error:
+        raise refusal(path, f"damaged {what}: {type(error).__name__}: {error}") from None
+
+
+def check_announced(
+    path: str | os.PathLike,
+    announced: int,
+    there: int,
+    refusal: Refusal = DescriptionError,
+    *,
+    times: int = 64,
+) -> None:
+    """That what a file says it unpacks to goes with its size: some kB can announce some GB.
+
+    Args:
+        announced: bytes in memory.
+        there: bytes in the file.
+        times: how well it may be packed.
+
+    Raises:
+        refusal: it is more than 64 MiB, and ``times`` as much as there is.
+    """
+    if announced > _UNASKED + times * there:
+        raise refusal(path, f"damaged: {there} bytes that announce {announced} bytes of figures")
 
 
 @contextlib.contextmanager

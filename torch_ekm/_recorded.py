@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from .exceptions import ParameterError, StateMismatchError
+from .exceptions import ParameterError, StateError, StateMismatchError
 
 #: options that decide nothing of what a state means
 _FREE = ("device", "on_invalid")
@@ -91,14 +91,15 @@ def make(described: Any, known: Mapping[str, Any]) -> Any:
     """What :func:`describe` wrote down, made again of the classes ``known`` by their names.
 
     Raises:
-        ParameterError: a name is not known, or something had no plain terms.
+        ParameterError: a name is not known.
+        StateError: something had no plain terms.
     """
     if isinstance(described, list):
         return [make(one, known) for one in described]
     if not isinstance(described, dict):
         return described
     if "opaque" in described:
-        raise ParameterError("file", described["opaque"], "of learners whose arguments are plain values")
+        raise StateError(f"a {described['opaque']} stands where learners of files have plain values")
     if "tensor" in described or "dtype" in described:
         dtype = getattr(torch, str(described["dtype"]), None)
         if not isinstance(dtype, torch.dtype):
@@ -240,3 +241,31 @@ def in_bounds(theirs: torch.Tensor, ours: torch.Tensor) -> bool:
     if theirs.is_floating_point():  # a limit may be infinite
         return not bool((theirs.isinf() & ours.isfinite()).any())
     return theirs.dtype == torch.bool or not bool(((theirs < 0) & (ours >= 0)).any())
+
+
+def covariance_problems(name: str, P: torch.Tensor, largest: torch.Tensor | None = None) -> list[str]:
+    """What is wrong with covariances ``(*batch, n, n)`` of a state.
+
+    Args:
+        largest: variances that nothing exceeds ``(n,)``; None: any.
+    """
+    size, variance = P.abs().amax(), P.diagonal(dim1=-2, dim2=-1)
+    symmetric = bool(((P - P.mT).abs() <= 1e-9 * size).all())
+    if not symmetric or not bool((torch.linalg.eigvalsh(P)[..., 0] > 0).all()):
+        return [f"{name} is no covariance"]
+    if largest is not None and bool((variance > (1 + 1e-6) * largest).any()):
+        return [f"{name}: less is known than at the start"]
+    return []
+
+
+def bound_problems(state: Mapping[str, Any], **bounds: tuple[float, float]) -> list[str]:
+    """Entries of a state that leave the range which their estimator keeps to: ``name=(least, largest)``."""
+    return [
+        f"{name} is not within {least:.6g} and {largest:.6g}"
+        for name, (least, largest) in bounds.items()
+        if not bool(
+            (
+                (state[name] >= least - 1e-9 * abs(least)) & (state[name] <= largest + 1e-9 * abs(largest))
+            ).all()
+        )
+    ]

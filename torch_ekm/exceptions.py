@@ -3,6 +3,14 @@
 One root, :class:`EKMError`, so that a control loop can catch all of them in one
 clause. Each child carries the offending data as attributes, lists the valid
 choices where there are any, and says in its message what would be right.
+
+That clause holds for what a loop calls with samples, readings, states and targets:
+learners and models (``update``, ``forward``, ``predict``, ``linearize``), a state's ``plus``
+and ``minus``, a target's ``error``, ``decide``, ``run``, ``steps``, ``reachability``, a plant's
+``command``, and ``update`` and ``learn`` of what is known of a hand. There a text or None in
+place of a tensor, a state or a target is a :class:`ParameterError`, too, and nothing was changed.
+Constructors, and functions that take what came through one of these doors, answer a wrong kind as
+Python does.
 """
 
 from __future__ import annotations
@@ -16,7 +24,8 @@ __all__ = [
     "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
     "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError",
     "ParameterError", "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
-    "StaleReadingError", "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
+    "StaleReadingError", "StateError", "StateMismatchError", "UnknownNameError", "UnstableGraspError",
+    "WorkerDiedError",
 ]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message
@@ -156,6 +165,13 @@ class ParameterError(EKMError, ValueError):
         if len(shown) > _LONGEST_VALUE:  # a large tensor, a whole module
             shown = f"{' '.join(shown.split())[:_LONGEST_VALUE]}..."
         super().__init__(f"{name} = {shown} is not valid; it must be {valid}")
+
+
+class StateError(EKMError, RuntimeError):
+    """Something is not as it must be for what is asked of it: not started, closed, empty, of another hand.
+
+    The message says what it is, and what would be right.
+    """
 
 
 # -- the grasp cannot be modelled -----------------------------------------------------------

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
 import torch
 from obedient_plant import Obedient
+from typer.testing import CliRunner
 
+from torch_ekm.cli import app
 from torch_ekm.control import (
     ClosedLoop,
     DescribedFigures,
@@ -17,8 +20,9 @@ from torch_ekm.control import (
     StopReason,
 )
 from torch_ekm.control.force_sensitivity import ForceSensitivity
-from torch_ekm.enhanced import EnhancedModel, save
-from torch_ekm.exceptions import FileFormatError, ParameterError, StateMismatchError
+from torch_ekm.control.knowledge import previous
+from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
+from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
 from torch_ekm.kinematics import ServoModel
 from torch_ekm.kinematics.servo_model import IdealServos
 from torch_ekm.residual import SparseOnlineGP
@@ -82,7 +86,7 @@ def test_a_plain_model_learns_nothing_of_the_servos(held) -> None:
 
 def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tmp_path) -> None:
     seen, axis, model = held
-    with pytest.raises(ParameterError, match="a hand with the actuators"):
+    with pytest.raises(StateError, match="a hand with the actuators"):
         ClosedLoop(
             Obedient(model, seen),
             LookAndMoveController(model, axis),
@@ -91,7 +95,7 @@ def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tm
     other = HandKnowledge(
         ServoModel(model.hand.actuator_names), ForceSensitivity(2, model.hand.n_a), DescribedFigures()
     )
-    with pytest.raises(ParameterError, match="a hand with 5 pads and 9 actuators"):
+    with pytest.raises(StateError, match="the hand has 5 pads and 9 actuators"):
         other.check(model.hand)
     save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")
     with pytest.raises(FileFormatError, match="holds a SparseOnlineGP, no HandKnowledge"):
@@ -109,3 +113,155 @@ def test_a_state_with_nan_is_refused_and_nothing_is_changed(driven, spoilt) -> N
     assert all(torch.equal(before[name], value) for name, value in knowledge.state_dict().items())
     knowledge.load_state_dict(driven.knowledge.state_dict())
     assert torch.equal(knowledge.figures.mean, driven.knowledge.figures.mean)
+
+
+def test_what_motions_taught_can_be_taken_back(driven) -> None:
+    knowledge, n_a = HandKnowledge.of(driven.controller.kinematic.hand), 9
+    states = []
+    for motion in range(12):
+        states.append({name: value.clone() for name, value in knowledge.state_dict().items()})
+        knowledge.checkpoint()
+        knowledge.servo.update(*torch.full((2, n_a), 0.01 * (motion + 1), dtype=torch.float64))
+        knowledge.forces.update(torch.full((n_a,), 0.01), torch.ones(5), torch.ones(5, n_a))
+        knowledge.pace.fill_(1 + 0.01 * motion)
+
+    def as_before(motion: int) -> bool:
+        now = knowledge.state_dict()
+        return all(torch.equal(now[name], value) for name, value in states[motion].items())
+
+    assert knowledge.take_back() == 1
+    assert as_before(11)
+    assert not as_before(10)
+    assert knowledge.take_back(3) == 3
+    assert as_before(8)
+    assert knowledge.take_back(100) == 4
+    assert as_before(4)
+    assert knowledge.take_back() == 0
+    assert as_before(4)
+    knowledge.checkpoint()
+    knowledge.load_state_dict(knowledge.state_dict())
+    assert knowledge.take_back() == 0  # of another state
+
+
+IMPOSSIBLE = {  # entry, an index, and a value that no estimator comes to
+    "bias": ("servo.estimate", (0, 1), 0.2),
+    "dead zone": ("servo.estimate", (3, 0), 0.2),
+    "dead zone before": ("servo.before", (3, 0), -0.2),
+    "no covariance": ("servo.covariance", ..., 0.0),
+    "a negative one": ("servo.covariance", (1, 0, 0), -1.0),
+    "not symmetric": ("servo.covariance", (1, 0, 1), 1.0),
+    "less than nothing": ("servo.before_covariance", (1, 0, 0), 1e3),
+    "weight": ("servo.weight", 2, 0.0),
+    "more than all": ("servo.weight", 2, 300.0),
+    "noise": ("servo.squares", 0, -1.0),
+    "no noise": ("servo.squares", 0, 0.0),
+    "stuck": ("servo.stuck", ..., True),
+    "failures": ("servo.failures", 0, -1),
+    "surprises": ("servo.surprises", 0, 2),
+    "forces": ("forces.theta", (0, 3), 6.0),
+    "forces of nothing": ("forces.theta", (4, 0), -2.0),
+    "spread of forces": ("forces.variance", 1, 1e6),
+    "no spread of forces": ("forces.variance", 1, 0.0),
+    "evidence": ("forces.evidence", (0, 1, 1), -1.0),
+    "endless evidence": ("forces.evidence", (0, 1, 1), 1e300),
+    "figures": ("figures.mean", 0, 5.1),
+    "figures before": ("figures.before", 0, -5.1),
+    "covariance of figures": ("figures.covariance", (0, 0), 1e3),
+    "usual": ("figures.usual", (), 1e30),
+    "change": ("figures.changed_at", (), 10_000),
+    "pace": ("pace", (), 1e9),
+    "pace back": ("pace", (), -0.5),
+}
+
+
+@pytest.mark.parametrize("what", IMPOSSIBLE)
+def test_figures_that_no_hand_can_have_are_refused_by_name(driven, tmp_path, what) -> None:
+    name, at, value = IMPOSSIBLE[what]
+    knowledge = HandKnowledge.of(driven.controller.kinematic.hand)
+    knowledge.load_state_dict(driven.knowledge.state_dict())
+    dict(knowledge.named_buffers())[name][at] = value
+    knowledge.save(tmp_path / "hand.ekm")
+    with pytest.raises(FileFormatError, match=name.replace(".", r"\.")):
+        HandKnowledge.load(tmp_path / "hand.ekm")
+
+
+def test_figures_that_no_motion_taught_are_refused(driven) -> None:
+    knowledge = HandKnowledge.of(driven.controller.kinematic.hand)
+    state = knowledge.state_dict()
+    with pytest.raises(StateMismatchError, match="no motion was learned"):
+        knowledge.load_state_dict({**state, "figures.mean": state["figures.mean"] + 1.0})
+    with pytest.raises(StateMismatchError, match="without evidence"):
+        knowledge.load_state_dict({**state, "forces.theta": state["forces.theta"] + 1.0})
+
+
+def test_whatever_is_learned_can_be_loaded(generator) -> None:
+    """Readings of all kinds, glitches of a radian among them, lead to states within the bounds."""
+
+    def draw(*shape: int) -> torch.Tensor:
+        size = 10 ** (6 * torch.rand((), generator=generator) - 4)
+        return size * torch.randn(*shape, generator=generator).double()
+
+    servo, forces, n = ServoModel("abcd"), ForceSensitivity(3, 4), 6
+    figures = ParameterFilter("abcdef", [0.0] * n, [0.5] * n, [-1.0] * n, [1.0] * n)
+    still = torch.rand(300, 4, generator=generator) < 0.4
+    for motion in range(300):
+        servo.update(draw(4), draw(4) * ~still[motion])
+        forces.update(draw(4), draw(3), draw(3, 4))
+        figures.update(draw(5), draw(5, n), draw(5).square() + 1e-6)
+        for part in (servo, forces, figures):
+            assert part.state_problems(part.state_dict()) == []
+    ideal = ServoModel("a")
+    for _ in range(3000):  # encoders that never err
+        ideal.update(torch.full((1,), 0.01), torch.full((1,), 0.01))
+    assert ideal.state_problems(ideal.state_dict()) == []
+
+
+def test_the_last_good_file_is_kept_and_named(driven, tmp_path) -> None:
+    path, knowledge = tmp_path / "hand.ekm", HandKnowledge.of(driven.controller.kinematic.hand)
+    driven.knowledge.save(path)
+    assert not previous(path).exists()
+    good = path.read_bytes()
+    knowledge.save(path)
+    assert previous(path).read_bytes() == good
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(
+        FileFormatError, match=r"cut short; the last file that was good is .*hand\.ekm\.previous"
+    ):
+        HandKnowledge.load(path)
+    knowledge.save(path)  # in place of a damaged file, which is not kept
+    assert previous(path).read_bytes() == good
+
+
+def test_parts_are_reset_alone(driven) -> None:
+    hand = driven.controller.kinematic.hand
+    fresh = HandKnowledge.of(hand).state_dict()
+    for part in ("servo", "forces", "figures", "pace"):
+        knowledge = HandKnowledge.of(hand)
+        knowledge.load_state_dict(driven.knowledge.state_dict())
+        knowledge.reset(part)
+        for name, value in knowledge.state_dict().items():
+            expected = fresh if name.startswith(part) else driven.knowledge.state_dict()
+            assert torch.equal(value, expected[name]), name
+    with pytest.raises(ParameterError, match="one of servo, forces, figures, pace"):
+        knowledge.reset("fingers")
+
+
+def test_what_is_believed_is_shown(driven, tmp_path) -> None:
+    path = tmp_path / "hand.ekm"
+    driven.knowledge.save(path)
+    shown = CliRunner().invoke(app, ["knowledge", str(path)])
+    assert shown.exit_code == 0, shown.output
+    assert "motions:" in shown.output
+    assert "that of 'icub_right'" in shown.output
+    other = CliRunner().invoke(app, ["knowledge", str(path), "--hand", "planar_two_finger", "--json"])
+    told = json.loads(other.output)
+    assert "a hand with the actuators" in told["description"]
+    assert told["motions"] == int(driven.knowledge.figures.count)
+    found = {(one["name"], one["figure"]): one for one in told["beliefs"]}
+    assert found["thumb_distal", "dead zone [deg]"]["value"] == pytest.approx(
+        float(driven.knowledge.servo.dead_zone[3]) / DEG
+    )
+    assert len(told["beliefs"]) == 2 * 9 + 5 + len(driven.knowledge.figures) + 1
+    assert CliRunner().invoke(app, ["knowledge", str(path), "--reset", "servo"]).exit_code == 0
+    assert not bool(HandKnowledge.load(path).servo.estimate.any())
+    assert bool(HandKnowledge.load(previous(path)).servo.estimate.any())

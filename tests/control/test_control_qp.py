@@ -14,7 +14,7 @@ from torch_ekm.control import (
     Squares,
 )
 from torch_ekm.control.qp import ControlSolution, build_qp
-from torch_ekm.exceptions import ParameterError, ShapeError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 
 DEG = math.pi / 180
 EFFORT = Squares(np.diag([1.0, 2.0]), np.zeros(2))  # u1^2 + 4 u2^2
@@ -84,7 +84,7 @@ def test_rows_that_ask_for_nothing() -> None:
 def test_bad_problem_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"lower\[0\].*upper\[0\] = -1"):
         build_qp(2, [Bounds(np.array([1.0, 0.0]), np.array([-1.0, 1.0]))])
-    with pytest.raises(ParameterError, match=r"A, b of Equality .* finite"):
+    with pytest.raises(NonFiniteError, match="A, b of Equality must be finite"):
         build_qp(2, [Equality(np.array([[np.nan, 1.0]]), np.array([1.0]))])
     with pytest.raises(ShapeError, match=r"b of Squares must have shape \(2,\), got \(1,\)"):
         build_qp(2, [Squares(np.eye(2), np.zeros(1))])
@@ -92,7 +92,7 @@ def test_bad_problem_is_refused() -> None:
         build_qp(2, [Inequality(np.eye(2), np.zeros((2, 1)))])
     with pytest.raises(ShapeError, match=r"upper of Bounds must have shape \(2,\), got \(3,\)"):
         build_qp(2, [Bounds(np.zeros(2), np.ones(3))])
-    with pytest.raises(ParameterError, match="lower of Bounds = 'NaN'"):
+    with pytest.raises(ParameterError, match=r"lower of Bounds = \[nan, 0"):
         build_qp(2, [EFFORT, Bounds(np.array([np.nan, 0.0]), np.ones(2))])
     with pytest.raises(ParameterError, match="unit of Squares"):
         build_qp(2, [Squares(np.eye(2), np.zeros(2), unit=0.0)])

@@ -297,7 +297,7 @@ def test_hostile_and_damaged_files(tmp_path: Path) -> None:
         with pytest.raises(exceptions.EKMError):
             torch_ekm.load(file)
     assert not ran.exists()
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(exceptions.FileFormatError, match="no such file"):
         torch_ekm.load(tmp_path / "nowhere")
 
 

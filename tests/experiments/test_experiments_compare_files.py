@@ -47,7 +47,62 @@ BROKEN = {
     "twice": ("a,a,y\n" + GOOD, r"two columns are called 'a'"),
     "nameless": ("a,,y\n" + GOOD, r"column 2 has no name"),
     "targets only": ("y1,y2,y3\n" + GOOD, r"all columns are targets"),
+    "decimal commas": ("a,b;y\n" + "1,5;2,5\n" * 3, r"line 2, column 'a,b': '1,5' has a decimal comma"),
+    "decimal comma in quotes": ('a,b,y\n1,"2,5",3\n', r"line 2, column 'b': '2,5' has a decimal comma"),
+    "underscores": ("a,b,y\n1,1_000,3\n", r"line 2, column 'b': '1_000' is no number"),
+    "full width": ("a,b,y\n1,\uff11\uff12,3\n", r"line 2, column 'b': '\uff11\uff12' is no number"),
+    "hexadecimal": ("a,b,y\n1,0x10,3\n", r"line 2, column 'b': '0x10' is no number"),
+    "infinite": ("a,b,y\n1,-Infinity,3\n", r"line 2, column 'b': '-Infinity' is not finite"),
+    "beyond float64": ("a,b,y\n1,1e999,3\n", r"line 2, column 'b': '1e999' is not finite"),
+    "a comment too late": ("a,b,y\n1,2,3\n# gripper opens\n", r"line 3 has 1 fields"),
+    "an open quote": ('a,b,y\n1,2,"3\n' + GOOD, r"line 52, column 'y': '3"),
+    "one long field": (f"a,b,y\n1,2,3\n1,{'9' * 200_000},3\n", r"line 3: field larger than field limit"),
+    "a long line": ("a,b,y\n" + "1," * 600_000, r"line 2 ends 1048576 characters without"),
+    "nothing but lines": ("\n" * 2_000_000, r"line 1048577 ends 1048576 characters without a figure"),
+    "wide": (",".join(f"a{i}" for i in range(100_000)) + "\n", r"100000 columns; at most 4096"),
+    "spread over lines": ("a,b,y\n" + '"1\n",' * 300_000, r"in a quote that does not close"),
+    "no numbers of its own": ("# a,b,y\n1,2,3\n", r"line 2 holds numbers only"),
 }
+
+ROWS = [[0.5, -1e-3, 3.0], [2.0, 1e20, -4.0]]
+SAME = {  # whoever writes them, these are a, b c, y and ROWS
+    "sep": ("sep=;\na;b c;y\n0.5;-1e-3;3\n2;+1E20;-4.\n", ["a", "b c", "y"]),
+    "sep in quotes": ('"SEP=\t"\r\na\tb c\ty\r\n.5\t-1e-3\t3\r\n2\t1e20\t-4\r\n', ["a", "b c", "y"]),
+    "sep against the header": ("sep=;\na,1;b c,2;y\n0.5;-.001;3\n2;1e20;-4", ["a,1", "b c,2", "y"]),
+    "blanks": ("  a , b c ,y  \n 0.5,\t-1e-3 , 3\n2 ,1e20, -4 \n", ["a", "b c", "y"]),
+    "blank lines": ("\n\na,b c,y\n\n0.5,-1e-3,3\n  \n2,1e20,-4\n\n\n", ["a", "b c", "y"]),
+    "comments": ("# one\n# two, three\na,b c,y\n0.5,-1e-3,3\n2,1e20,-4\n", ["a", "b c", "y"]),
+    "the end of a line": ("a;b c;y;\n0.5;-1e-3;3;\n2;1e20;-4;\n", ["a", "b c", "y"]),
+    "the end of some lines": ("a,b c,y\n0.5,-1e-3,3,\n2,1e20,-4\n", ["a", "b c", "y"]),
+    "old Mac": ("a,b c,y\r0.5,-1e-3,3\r2,1e20,-4\r", ["a", "b c", "y"]),
+    "commas in names": ('"p (x, y)";"b; c";y\n0.5;-1e-3;3\n2;1e20;-4\n', ["p (x, y)", "b; c", "y"]),
+    "semicolons in names": ('"p (x; y; z)","b; c",y\n0.5,-1e-3,3\n2,1e20,-4\n', ["p (x; y; z)", "b; c", "y"]),
+    "blanks before quotes": ('a, "b, c", "y"\n0.5, "-1e-3", 3\n2, 1e20 , -4\n', ["a", "b, c", "y"]),
+    "quotes in quotes": ('"a ""1""",b,y\n0.5,-1e-3,3\n2,1e20,-4\n', ['a "1"', "b", "y"]),
+    "lines in names": ('"a\n[m]",b c,y\n0.5,-1e-3,3\n2,1e20,-4\n', ["a\n[m]", "b c", "y"]),
+    "lines of Unicode": ("a\u2028b,b\x0bc,y\n0.5,-1e-3,3\n2,1e20,-4\n", ["a\u2028b", "b\x0bc", "y"]),
+    "more commas than semicolons": ("a,1,2,3,4;b;y\n0.5;-1e-3;3\n2;1e20;-4\n", ["a,1,2,3,4", "b", "y"]),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+@pytest.mark.parametrize("case", SAME)
+def test_tables_are_read_whoever_wrote_them(case: str, encoding: str, tmp_path: Path) -> None:
+    text, expected = SAME[case]
+    (tmp_path / "a.csv").write_bytes(text.encode(encoding))
+    names, read = open_table(tmp_path / "a.csv")
+    assert list(names) == expected
+    np.testing.assert_array_equal(read(names), ROWS)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "named"),
+    [("latin-1", "LATIN1"), ("utf-16", "UTF-16"), ("utf-32", "UTF-32"), ("utf-16-be", "UTF-16BE")],
+)
+def test_other_encodings_are_named_with_the_way_out(encoding: str, named: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes("a,größe,y\n1,2,3\n".encode(encoding))
+    with pytest.raises(DescriptionError, match=f"iconv -f {named} -t UTF-8"):
+        open_table(tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize("case", BROKEN)
@@ -60,7 +115,7 @@ def test_a_broken_file_is_told_by_line_and_column(case: str, tmp_path: Path) -> 
 
 
 def test_other_files(tmp_path: Path) -> None:
-    with pytest.raises(DescriptionError, match="no such file"):
+    with pytest.raises(DescriptionError, match="no such CSV file"):
         load_table(tmp_path / "nothing.csv")
     (tmp_path / "a.xlsx").write_text("x")
     with pytest.raises(DescriptionError, match=r"'\.xlsx' are not read"):

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from torch_ekm.description import load_hand
-from torch_ekm.exceptions import ParameterError
+from torch_ekm.exceptions import StateError
 from torch_ekm.inspection.health import hand_health
 from torch_ekm.kinematics import ActuationMap
 from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog
@@ -122,7 +122,7 @@ def test_tendons_that_give_way_when_the_object_is_lost_are_no_change() -> None:
 def test_a_log_of_another_hand_is_refused() -> None:
     made = Made(0)
     made.move(2)
-    with pytest.raises(ParameterError, match=r"trial 5.*4 joints, 2 actuators.*'icub_right'"):
+    with pytest.raises(StateError, match=r"trial 5.*4 joints and 2 actuators.*'icub_right'"):
         hand_health(load_hand("icub_right"), [(5, made.log)])
 
 

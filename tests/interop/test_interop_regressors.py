@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize, interop
-from torch_ekm.exceptions import MissingExtraError, NonFiniteError, ParameterError, ShapeError
+from torch_ekm.exceptions import MissingExtraError, NonFiniteError, ParameterError, ShapeError, StateError
 from torch_ekm.interop import OnlineRegressor, as_river
 from torch_ekm.interop.online_regressor import make_learner
 
@@ -79,7 +79,7 @@ def test_features_come_and_go_by_name() -> None:
 
 
 def test_a_wrong_learner_is_named() -> None:
-    with pytest.raises(ParameterError, match="one model of 3 inputs and 1 outputs"):
+    with pytest.raises(StateError, match="one model of 3 inputs and 1 outputs"):
         make_learner(small(2, 1), 3, 1)
     regressor = OnlineRegressor(small(3, 1))
     with pytest.raises(ParameterError, match="level"):

@@ -10,7 +10,7 @@ import torch
 from calibration_toys import Toy
 
 from torch_ekm.description import load_hand, write_transmission
-from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.exceptions import DescriptionError, ParameterError, StateError, UnknownNameError
 from torch_ekm.kinematics import Play
 from torch_ekm.model import calibrate
 from torch_ekm.model.calibration.motions import rests
@@ -118,7 +118,7 @@ def test_bad_input_is_refused(toy):
     with pytest.raises(ParameterError):
         calibrate(model, recordings, [])
     recordings[0].observations[1].status = "lost"
-    with pytest.raises(ParameterError, match="usable"):
+    with pytest.raises(StateError, match="no motion of the recordings can be used"):
         calibrate(model, recordings, ["springs"])
 
 

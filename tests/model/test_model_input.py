@@ -83,7 +83,11 @@ WRONG = {
     "NaN in friction": (lambda: with_contacts(**at("friction", NAN)), NonFiniteError, "friction"),
     "negative friction": (lambda: with_contacts(**at("friction", -0.5)), ParameterError, "f1_l2"),
     "negative gamma": (lambda: with_contacts(**at("torsional_friction", -1e-3)), ParameterError, "torsional"),
-    "normal not unit": (lambda: with_contacts(normal=1.1 * CONTACTS.normal), ParameterError, "length 1.1"),
+    "normal not unit": (
+        lambda: with_contacts(normal=1.1 * CONTACTS.normal),
+        ParameterError,
+        "unit length, not 1.1",
+    ),
     "normal zero": (lambda: with_contacts(**at("normal", 0.0)), ParameterError, "f1_l2"),
     "curvature misshapen": (lambda: with_contacts(object_curvature=EYE), ShapeError, "object_curvature"),
     "friction misshapen": (lambda: with_contacts(friction=torch.ones(2)), ShapeError, "friction"),

@@ -8,7 +8,7 @@ import pytest
 import torch
 from fakes import FakePlant
 
-from torch_ekm.exceptions import NonFiniteError, ParameterError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, StateError
 from torch_ekm.plant import Observation, Plant, PlantWrapper, RecordingPlant, ReplayedPlant, Truth
 
 EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
@@ -89,7 +89,7 @@ def test_what_is_recorded_in_mid_grasp_can_be_replayed() -> None:
     again = ReplayedPlant(plant.trajectory)
     assert int(again.observe().q[0]) == 3
     assert int(again.command(torch.tensor(2)).q[0]) == 5
-    with pytest.raises(ParameterError, match="command = 2 is not valid; it must be at most 1"):
+    with pytest.raises(StateError, match="the recording ends after 1 commands"):
         again.command(torch.tensor(2))
     looked = RecordingPlant(inner)
     looked.observe()

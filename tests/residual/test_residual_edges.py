@@ -11,7 +11,7 @@ import torch
 from as_published import deep_sogp, sogp
 
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, StateError, UnknownNameError
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernelSOGP,
@@ -237,7 +237,7 @@ def test_what_is_no_real_number_is_named(make):
 def test_a_learner_made_in_inference_mode_is_named(make):
     with torch.inference_mode():
         learner = make(3, 2)
-    with pytest.raises(ParameterError, match="made outside"):
+    with pytest.raises(StateError, match="make it outside"):
         learner.update(torch.zeros(3), torch.zeros(2))
 
 

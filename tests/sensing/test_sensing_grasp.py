@@ -10,7 +10,7 @@ import torch
 from fakes import FakePlant
 
 from torch_ekm.description import load_hand, load_object
-from torch_ekm.exceptions import ObjectLostError, ParameterError
+from torch_ekm.exceptions import ObjectLostError, ParameterError, StateError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
@@ -143,7 +143,7 @@ def test_object_not_seen_is_said(hand, obj):
             return dataclasses.replace(super().observe(), status=PlantStatus.NOT_SEEN)
 
     plant = SensedPlant(Hidden(hand), hand, obj)
-    with pytest.raises(ParameterError, match="reset"):
+    with pytest.raises(StateError, match="reset"):
         plant.observe()
     with pytest.raises(ObjectLostError, match="5 frames"):
         plant.reset(seed=0)

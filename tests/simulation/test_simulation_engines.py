@@ -11,7 +11,7 @@ import torch
 from turning_step import true_state, turning_step
 
 from torch_ekm.description import load_hand
-from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.exceptions import ParameterError, StateError, UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.kinematics.se3 import log
 from torch_ekm.model import KinematicModel
@@ -233,7 +233,7 @@ def test_the_environment_takes_it_too() -> None:
 def test_native_tendons_do_not_change() -> None:
     plant = mujoco_hand(tendon="native")
     plant.reset(3)
-    with pytest.raises(ParameterError, match="change in mid-run"):
+    with pytest.raises(StateError, match="change in mid-run"):
         plant.change(moment_arm=1.2)
     plant.change(friction=0.9)
 

@@ -20,6 +20,7 @@ from torch_ekm.exceptions import (
     NonFiniteError,
     ParameterError,
     ShapeError,
+    StateError,
     UnknownNameError,
 )
 from torch_ekm.model import KinematicModel
@@ -211,7 +212,7 @@ def test_a_snapshot_outlives_the_scene_it_was_taken_in():
 
 def test_a_held_object_does_not_grow(plant, grasped):
     plant.restore(grasped)
-    with pytest.raises(ParameterError, match=r"held; close\(\)"):
+    with pytest.raises(StateError, match=r"cannot grow: close\(\)"):
         plant.change(object_scale=1.05, mass=2.0)
     assert plant.parameters == PlantParameters()
     plant.change(object_scale=1.0)  # no change

@@ -8,7 +8,7 @@ import pytest
 import torch
 from fakes import FakePlant
 
-from torch_ekm.exceptions import DescriptionError, ParameterError
+from torch_ekm.exceptions import DescriptionError, ParameterError, StateError
 from torch_ekm.plant import Observation, Plant, PlantStatus, RecordingPlant, ReplayedPlant, Trajectory, Truth
 from torch_ekm.plant.trial_file import read_trial, write_trial
 from torch_ekm.simulation import Tug
@@ -78,7 +78,7 @@ def test_a_saved_recording_replays_like_the_original(tmp_path):
         assert now.info["raw"]["hall"].dtype == torch.uint8
     assert [o.info.get("events", ()) for o in seen] == [(), (), (str(Tug(at=1, force=(0.0, 0.0, 5.0))),), ()]
     assert [o.status for o in seen] == [PlantStatus.HELD] * 4
-    with pytest.raises(ParameterError, match="ends there"):
+    with pytest.raises(StateError, match="the recording ends after"):
         replayed.command(torch.zeros(3))
     assert torch.equal(replayed.reset(0).q, original.observations[0].q)
 
@@ -92,7 +92,7 @@ def test_a_hand_without_fingertip_sensors(tmp_path):
     with h5py.File(tmp_path / "run.h5") as file:
         assert "fingertip_force" not in file
     blind[1] = dataclasses.replace(blind[1], fingertip_force=torch.ones(1))
-    with pytest.raises(ParameterError, match="fingertip_force"):
+    with pytest.raises(StateError, match="fingertip_force"):
         trajectory.save(tmp_path / "mixed.h5")
 
 
@@ -125,10 +125,10 @@ def test_what_is_not_a_recording_is_refused(tmp_path):
             Trajectory(about=about).save(tmp_path / "never.h5")
     ragged = record()
     ragged.observations[1].info["raw"] = {"hall": torch.zeros(5)}
-    with pytest.raises(ParameterError, match="raw/"):
+    with pytest.raises(StateError, match="raw/"):
         ragged.save(tmp_path / "never.h5")
     assert not list(tmp_path.glob("never*"))
-    with pytest.raises(ParameterError, match="at least one"):
+    with pytest.raises(StateError, match="the trajectory is empty"):
         ReplayedPlant(Trajectory())
 
 

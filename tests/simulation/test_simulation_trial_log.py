@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_ekm.exceptions import DescriptionError, GraspError, OutputError, ParameterError
+from torch_ekm.exceptions import DescriptionError, GraspError, OutputError, ParameterError, StateError
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
 from torch_ekm.plant.trial_log import TrialEntry
 from torch_ekm.simulation import PlantParameters, SimulatedHand
@@ -165,7 +165,7 @@ def test_what_is_no_log_of_this_run_is_refused(unbroken, tmp_path):
     log = TrialLog.open(unbroken)
     with pytest.raises(DescriptionError, match=r"no trial 9; there are 0, 1, 2, 3"):
         log.read(9)
-    with pytest.raises(ParameterError, match="opened with"):
+    with pytest.raises(StateError, match="closed, or opened to be read"):
         log.write(9, Trajectory())
     log = TrialLog(unbroken, CONFIGURATION)
     with pytest.raises(ParameterError, match="not in the log yet"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from json import dumps
 from pathlib import Path
 from typing import Annotated
 
@@ -105,3 +106,43 @@ def health(
         raise typer.Exit(1)
     few = "" if sum(motions) > BASELINE else f" An actuator is judged after {BASELINE} motions."
     say(f"No actuator changed in {sum(motions)} motions.{few}")
+
+
+@app.command()
+@needs("robot")
+def knowledge(
+    file: Annotated[Path, Argument(metavar="EKM", help="File of what a closed loop has learned of a hand.")],
+    hand: Annotated[str, Option(help="The hand; else the one that it was learned of.")] = "",
+    reset: Annotated[list[str], Option(help="servo, forces, figures or pace: forget it; repeatable.")] = [],  # noqa: B006
+    json: Annotated[bool, Option("--json", help="All figures, as JSON.")] = False,
+) -> None:
+    """Show what is believed of a hand, since when, and where that differs from its description.
+
+    Differences are those of more than two standard errors. With --reset parts are forgotten; the file as it
+    was is kept beside, with the ending .previous.
+    """
+    from ..control import HandKnowledge
+    from ..inspection.knowledge import Belief, about, beliefs
+
+    learned = HandKnowledge.load(file)
+    for part in reset:
+        learned.reset(part)  # pyright: ignore[reportArgumentType]
+    if reset:
+        learned.save(file)
+    told, found = about(learned, file, hand), beliefs(learned)
+    if json:
+        say(dumps({**told, "beliefs": [one._asdict() for one in found]}, indent=1))
+        return
+    for name, value in told.items():
+        say(f"{name + ':':13}{value}")
+    rows = [
+        (one.part, one.name, one.figure, *map(_short, (one.value, one.std, one.described)), one.note)
+        for one in found
+        if one.deviates
+    ]
+    print_table([*Belief._fields[:3], "believed", "+-", "described", ""], rows, str(file))
+    say(f"{len(found) - len(rows)} figures are as described, or not identified (--json lists them).")
+
+
+def _short(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"

@@ -111,7 +111,8 @@ class ContactSet:
         if size and not (min(size) > 1 - _UNIT and max(size) < 1 + _UNIT):
             worst = max(range(len(size)), key=lambda k: abs(size[k] - 1))
             where = f"contacts.normal of '{self.finger[worst % self.n_c]}'"
-            raise ParameterError(where, f"a vector of length {size[worst]:.4g}", "of unit length")
+            normal = self.normal.reshape(-1, 3)[worst].tolist()
+            raise ParameterError(where, normal, f"of unit length, not {size[worst]:.4g}")
         for name in ("friction", "torsional_friction"):
             for finger, value in zip(self.finger, getattr(self, name).tolist(), strict=True):
                 if value < 0:

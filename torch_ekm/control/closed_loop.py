@@ -63,7 +63,8 @@ class ClosedLoop:
             that is 5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses.
 
     Raises:
-        ParameterError: no controller, or knowledge of another hand.
+        ParameterError: no controller.
+        StateError: knowledge of another hand.
     """
 
     def __init__(

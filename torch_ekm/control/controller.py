@@ -17,7 +17,7 @@ from ..kinematics import GraspState
 from ..model import KinematicModel, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, StopReason
-from .focus import FocusedPose, PoseTarget
+from .focus import A_TARGET, FocusedPose, PoseTarget
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .pace import Pace, contact_travel
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
@@ -187,7 +187,7 @@ class LookAndMoveController:
             fingertip_force = fingertip_force.where(fingertip_force.abs() >= least, torch.nan)
             if bool(fingertip_force.isnan().all()):
                 fingertip_force = None
-        error = target.error(state)
+        error = check_kind("target", target, PoseTarget, A_TARGET).error(state)
         check_shape("target", error, (6,))
         check_finite("target", error)
         focused = self.focus.matrix @ error

@@ -10,12 +10,13 @@ import torch
 
 from .._checks import check_finite, check_kind, check_positive, check_shape
 from ..exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
-from ..kinematics.grasp_state import GraspState, check_rotation
+from ..kinematics.grasp_state import A_STATE, GraspState, check_rotation
 from ..kinematics.null_space import null_space
 from ..kinematics.se3 import exp, log
 from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 
+A_TARGET = "a PoseTarget, e.g. PoseTarget.turned(state, axis, degrees=20)"
 _SI = {"deg": math.pi / 180, "mm": 1e-3}
 _USUAL = {"tolerance": {"deg": 0.25, "mm": 0.2}, "step": {"deg": 2.5, "mm": 2.0}}  # what counts alike
 
@@ -41,6 +42,7 @@ class PoseTarget:
 
     def error(self, state: GraspState) -> Float[Tensor, " 6"]:
         """``(o_r - o_f, Log(R_r R_f^T))`` [m, rad]: the twist that would bring the object home."""
+        check_kind("state", state, GraspState, A_STATE)
         position, rotation = self.position.to(state.position), self.rotation.to(state.rotation)
         return torch.cat([position - state.position, log(rotation @ state.rotation.mT)])
 

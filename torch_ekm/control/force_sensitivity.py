@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,16 @@ import torch
 from torch import nn
 
 from .._checks import check_finite, check_shape
-from .._recorded import Recorded
+from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
-_NOISE_STD = 0.25  # [N] of a change of force that c and B do not explain, at least
+_FURTHEST = 5.0  # priors: bounds of theta
+_NOISE_STD, _LARGEST_STD = (
+    0.25,
+    20.0,
+)  # [N] of a change of force that c and B do not explain, at least, at most
+_MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 _KEPT, _TAKEN = 0.5, 0.3  # of the drift before, of the last motion
@@ -56,6 +61,12 @@ class ForceSensitivity(Recorded, nn.Module):
     def scale(self) -> Float[Tensor, " n_pads"]:
         """c."""
         return 1 + self.theta[:, 0]
+
+    @property
+    def scale_std(self) -> Float[Tensor, " n_pads"]:
+        """Standard error of c."""
+        information = self.evidence / self.variance[:, None, None] + torch.eye(self.theta.shape[-1]).double()
+        return torch.linalg.inv(information)[:, 0, 0].sqrt()
 
     @property
     def correction(self) -> Float[Tensor, "n_pads n_a"]:
@@ -122,9 +133,26 @@ class ForceSensitivity(Recorded, nn.Module):
         drift[known] = (_KEPT * drift + _TAKEN * bounded)[known]
         gain = _gain(D, variance, u) / variance[:, None]
         theta[known] += bounded[known, None] * gain[known]
-        unexplained = np.maximum(bounded**2 - doubt, _NOISE_STD**2)
+        np.clip(theta, -_FURTHEST, _FURTHEST, out=theta)
+        unexplained = np.clip(bounded**2 - doubt, _NOISE_STD**2, _LARGEST_STD**2)
         variance[known] += _RECENT * (unexplained - variance)[known]
         return torch.from_numpy(r)
+
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the entries of a state that is to be loaded."""
+        wrong = bound_problems(
+            state,
+            theta=(-_FURTHEST, _FURTHEST),
+            variance=(_NOISE_STD**2, _LARGEST_STD**2),
+            evidence=(-_MOST_EVIDENCE, _MOST_EVIDENCE),
+        )
+        if wrong:
+            return wrong
+        D = state["evidence"]  # of the drift a grasp makes a new one
+        if bool((state["theta"].any(-1) & ~D.flatten(1).any(-1)).any()):
+            return ["theta is known of a pad without evidence"]
+        unit = (1e-9 + 1e-9 * D.abs().amax((-2, -1), keepdim=True)) * torch.eye(D.shape[-1], dtype=D.dtype)
+        return covariance_problems("evidence", D + unit)  # it begins at 0, and rounding makes some below
 
     def extra_repr(self) -> str:
         return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections import deque
 from collections.abc import Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import torch
 from torch import nn
 
-from .._recorded import Recorded, check_state, describe
+from .._files import write_whole
+from .._recorded import Recorded, bound_problems, check_state, describe, make
 from ..description import HandDescription
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
-from ..exceptions import FileFormatError, ParameterError
+from ..exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
+from ..typing import Tensor
 from .force_sensitivity import ForceSensitivity
+from .pace import LARGEST
+
+Part = Literal["servo", "forces", "figures", "pace"]
+_KEPT = 8  # motions whose lessons can be taken back
 
 
 class HandKnowledge(Recorded, nn.Module):
@@ -46,6 +55,7 @@ class HandKnowledge(Recorded, nn.Module):
         self.servo, self.forces, self.figures = servo, forces, figures
         self.pace = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))
         """p at the end of the last turn, if that reached its target; else 0."""
+        self._before: deque[dict[str, Tensor]] = deque(maxlen=_KEPT)  # states before the last motions
 
     @classmethod
     def of(cls, hand: HandDescription, *, learns: bool = True, adapts: bool = True) -> HandKnowledge:
@@ -63,17 +73,30 @@ class HandKnowledge(Recorded, nn.Module):
         """That it is of this hand.
 
         Raises:
-            ParameterError: actuators, pads or figures of its description are others.
+            StateError: actuators, pads or figures of its description are others.
         """
         if tuple(self.servo.names) != tuple(hand.actuator_names):
-            names = ", ".join(self.servo.names)
-            valid = f"that of a hand with the actuators {', '.join(hand.actuator_names)}"
-            raise ParameterError("knowledge", f"of a hand with the actuators {names}", valid)
+            ours, theirs = (", ".join(names) for names in (self.servo.names, hand.actuator_names))
+            raise StateError(f"the knowledge is of a hand with the actuators {ours}; this one has {theirs}")
         shape = tuple(self.forces.correction.shape)
         if shape != (len(hand.pads), hand.n_a):
-            valid = f"that of a hand with {len(hand.pads)} pads and {hand.n_a} actuators"
-            raise ParameterError("knowledge", f"of {shape[0]} pads and {shape[1]} actuators", valid)
+            here = f"{len(hand.pads)} pads and {hand.n_a} actuators"
+            raise StateError(
+                f"the knowledge is of {shape[0]} pads and {shape[1]} actuators, the hand has {here}"
+            )
         self.figures.check(hand)
+
+    def checkpoint(self) -> None:
+        """Before a motion is learned: what is known now can be had back by :meth:`take_back`."""
+        self._before.append({name: value.clone() for name, value in self.state_dict().items()})
+
+    def take_back(self, motions: int = 1) -> int:
+        """All parts are as they were before the last ``motions`` checkpoints, eight of which are kept; how
+        many that were."""
+        taken = [self._before.pop() for _ in range(min(motions, len(self._before)))]
+        if taken:
+            super().load_state_dict(taken[-1], strict=False)  # a part may have been exchanged since
+        return len(taken)
 
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
@@ -85,14 +108,38 @@ class HandKnowledge(Recorded, nn.Module):
         """
         if strict:
             check_state(self, state_dict)
+        self._before.clear()
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the entries of a state that is to be loaded; each part looks at its own."""
+        return bound_problems(state, pace=(0, LARGEST))
+
+    def reset(self, part: Part) -> None:
+        """Nothing is known of this part any more.
+
+        Raises:
+            ParameterError: there is no such part.
+        """
+        if part not in get_args(Part):
+            raise ParameterError("part", part, f"one of {', '.join(get_args(Part))}")
+        if part == "pace":
+            self.pace.zero_()
+        else:
+            held = getattr(self, part)
+            held.load_state_dict(make(describe(held), known_classes()).state_dict())
+
     def save(self, path: str | os.PathLike) -> None:
-        """Write all of it; the file appears whole or not at all.
+        """Write all of it; the file appears whole or not at all. The one that it replaces is kept beside, if
+        it can be loaded: ``hand.ekm.previous``.
 
         Raises:
             OutputError: the file cannot be written.
         """
+        path = Path(path)
+        with contextlib.suppress(FileFormatError):
+            self.load(path)
+            write_whole(previous(path), path.read_bytes())
         write(path, describe(self), self.state_dict())
 
     @classmethod
@@ -100,11 +147,23 @@ class HandKnowledge(Recorded, nn.Module):
         """What :meth:`save` wrote. Nothing in the file is ever run.
 
         Raises:
-            FileFormatError: it is no such file, or damaged.
-            StateMismatchError: state and description do not go together.
+            FileFormatError: it is no such file, damaged, or states what no hand can have; the message names
+                the last good file, if there is one.
         """
-        described, state = read(path)
-        made = rebuild(path, described, state, known_classes())
-        if not isinstance(made, cls):
-            raise FileFormatError(path, f"holds a {type(made).__name__}, no {cls.__name__}")
-        return made
+        try:
+            described, state = read(path)
+            made = rebuild(path, described, state, known_classes())
+            if not isinstance(made, cls):
+                raise FileFormatError(path, f"holds a {type(made).__name__}, no {cls.__name__}")
+            return made
+        except (FileFormatError, StateMismatchError) as error:
+            problem = error.problem if isinstance(error, FileFormatError) else str(error)
+            if previous(path).is_file():
+                problem += f"; the last file that was good is {previous(path)}: copy it here to go on with it"
+            raise FileFormatError(path, problem) from None
+
+
+def previous(path: str | os.PathLike) -> Path:
+    """Where :meth:`HandKnowledge.save` keeps the file that it replaces."""
+    path = Path(path)
+    return path.with_name(f"{path.name}.previous")

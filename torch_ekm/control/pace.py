@@ -33,6 +33,7 @@ SLIDES = 2.0  # rho of the twist alone from which the object is thought to slide
 _WEAK, FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
 _ON, _OFF = 1 * _DEG, 3 * _DEG  # of the axis: up to which, and from which, the object counts as off it
 _UNFELT = 1.0  # largest p where no pad measures: forces that nobody sees drift with the way that is made
+LARGEST = 8.0  # p of any trust region: the steps of 20 deg that guards let pass at most
 _FOR_NEW = 1.4  # largest p with an object that is new to a hand whose figures are known
 _USED = 0.7  # a motion below this share of what was allowed says nothing for a larger one
 
@@ -210,6 +211,8 @@ class TrustRegion:
     largest: float = 2.0
 
     def __post_init__(self) -> None:
+        if not self.largest <= LARGEST:
+            raise ParameterError("largest", self.largest, f"at most {LARGEST:g}")
         if not 0 < self.smallest <= self.largest:
             valid = f"above 0 and at most largest = {self.largest:g}"
             raise ParameterError("smallest", self.smallest, valid)

@@ -12,7 +12,7 @@ import numpy as np
 
 from .._extras import require
 from ..contact.forces.active_set import EqualityProgram, solve_by_active_set
-from ..exceptions import ParameterError, ShapeError, SolverError
+from ..exceptions import NonFiniteError, ParameterError, ShapeError, SolverError
 from ..typing import Array, Tensor
 
 Numbers = Tensor | Array | float
@@ -153,8 +153,8 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
         rows: of each task and limit; None asks for nothing.
 
     Raises:
-        ParameterError: no rows, a negative weight, a unit of 0, bounds that cross, or a figure that is not
-            finite.
+        ParameterError: no rows, a negative weight, a unit of 0, or bounds that cross or are NaN.
+        NonFiniteError: another figure is not finite.
         ShapeError: rows of another number of actuators, or not one right side for each row.
     """
     P, q = np.zeros((n_u, n_u)), np.zeros(n_u)
@@ -192,7 +192,7 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
     C, h, rho_t = _stack(kept)
     for name, value in (("cost", P), ("cost", q), ("equality", E), ("equality", d), ("rows", C), ("rows", h)):
         if not np.isfinite(value).all():
-            raise ParameterError(name, "NaN or infinity", "finite")
+            raise NonFiniteError(name)
     return ControlProblem(P, q, (E, d, rho), (C, h, rho_t), (lower, upper))
 
 
@@ -205,14 +205,14 @@ def _check(row: Rows, n_u: int) -> None:
             if value.shape not in ((), (n_u,)):
                 raise ShapeError(f"{name} of Bounds", f"({n_u},)", value.shape)
             if np.isnan(value).any():
-                raise ParameterError(f"{name} of Bounds", "NaN", "a number, or infinite")
+                raise ParameterError(f"{name} of Bounds", value.tolist(), "numbers, or infinite")
         return
     if b.shape not in ((), A.shape[:-1]):
         raise ShapeError(f"{row._fields[1]} of {kind}", f"{A.shape[:-1]}", b.shape, "one entry for each row")
     if isinstance(row, Squares | Inequality) and not (as_array(row.unit) > 0).all():
         raise ParameterError(f"unit of {kind}", row.unit, "greater than 0")
     if not (np.isfinite(A).all() and np.isfinite(b).all()):
-        raise ParameterError(f"{row._fields[0]}, {row._fields[1]} of {kind}", "NaN or infinity", "finite")
+        raise NonFiniteError(f"{row._fields[0]}, {row._fields[1]} of {kind}")
 
 
 def as_array(x: Numbers) -> Array:

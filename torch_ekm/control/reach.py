@@ -12,6 +12,7 @@ from enum import Enum
 import numpy as np
 import torch
 
+from .._checks import check_kind
 from ..exceptions import GraspError, ParameterError, SolverError
 from ..kinematics import GraspState
 from ..model import Linearization
@@ -19,7 +20,7 @@ from ..plant import Observation, Plant
 from ..typing import Float, Tensor
 from .controller import LookAndMoveController
 from .decision import StopReason
-from .focus import FocusedPose, PoseTarget
+from .focus import A_TARGET, FocusedPose, PoseTarget
 from .limits import ActuatorLimit
 from .manipulation import Step, Stop
 from .model_hand import ModelHand
@@ -140,7 +141,7 @@ def reachability(
     controller: LookAndMoveController, caution: Caution, seen: Observation, target: PoseTarget
 ) -> Reachability:
     """See :meth:`~torch_ekm.control.ClosedLoop.reachability`."""
-    focus, error = controller.focus, target.error(seen.state)
+    focus, error = controller.focus, check_kind("target", target, PoseTarget, A_TARGET).error(seen.state)
     lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)
     model, asked = LinearizedModel.about(torch.zeros_like(seen.a), lin), focus.matrix @ error
     whole = Situation(controller.kinematic.hand, focus, seen.state, seen.a, None, error, asked)

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from .._text import read_text
 from ..exceptions import DescriptionError
 
 _NOTHING = object()
@@ -23,14 +24,10 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     """The whole file as a dict, nested eight deep at most, with integers of 64 bits.
 
     Raises:
-        DescriptionError: no such file, not TOML, larger than 64 KiB, a line of more than 4096
+        DescriptionError: no such file, not UTF-8, not TOML, larger than 64 KiB, a line of more than 4096
             characters, or nested deeper.
     """
-    content = read_bounded(path, what, _LARGEST_FILE)
-    try:
-        text = content.decode()
-    except UnicodeDecodeError as error:
-        raise DescriptionError(path, f"not well-formed TOML: {error}") from None
+    text = toml_text(path, what)
     for number, line in enumerate(text.split("\n"), 1):
         if len(line) > _LONGEST_LINE:
             raise DescriptionError(path, f"line {number} has more than {_LONGEST_LINE} characters")
@@ -42,22 +39,13 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     return data
 
 
-def read_bounded(path: Path, what: str, largest: int) -> bytes:
-    """The contents of a file of at most ``largest`` bytes.
+def toml_text(path: Path, what: str) -> str:
+    """The file as text, of at most 64 KiB in UTF-8.
 
     Raises:
-        DescriptionError: no such file, a larger one, or one that cannot be read.
+        DescriptionError: it is no such file.
     """
-    if not path.is_file():
-        raise DescriptionError(path, f"no such {what}")
-    try:
-        with path.open("rb") as file:
-            content = file.read(largest + 1)
-    except OSError as error:
-        raise DescriptionError(path, f"cannot be read: {error.strerror}") from None
-    if len(content) > largest:
-        raise DescriptionError(path, f"a {what} has at most {largest} bytes, this one is larger")
-    return content
+    return read_text(path, what, _LARGEST_FILE)
 
 
 def _check_depth(path: Path, data: dict[str, Any]) -> None:

@@ -6,15 +6,15 @@ Meshes and textures are never opened, and no file outside the folder of the firs
 
 from __future__ import annotations
 
+import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
 from .._extras import require
 from ..exceptions import DescriptionError
-from ._toml import read_bounded
+from ._xml import read_xml
 
-_LARGEST_FILE = 4 << 20  # bytes
 _MOST_ELEMENTS = 20_000  # of all files together
 _MOST_FILES = 50
 _READ = ("compiler", "option", "default", "worldbody", "tendon", "equality", "actuator")
@@ -71,28 +71,26 @@ def _read(path: Path) -> tuple[ET.Element, list[Path]]:
         raise DescriptionError(path, "elements are nested too deep") from None
 
 
+def _real(path: Path) -> Path:
+    return Path(os.path.realpath(path))  # as resolve(), which raises where links lead in a circle
+
+
 class _Reader:
     """Files of one folder, each in the place of its ``<include>``."""
 
     def __init__(self, path: Path) -> None:
-        self.folder = path.resolve().parent
+        self.folder = _real(path).parent
         self.elements = 0
         self.files: list[Path] = []
 
     def read(self, path: Path, above: tuple[Path, ...]) -> ET.Element:
-        real = path.resolve()
+        real = _real(path)
         if not real.is_relative_to(self.folder):
             raise DescriptionError(above[-1], f"<include> of '{path}', which is outside {self.folder}")
         if real in above:
             raise DescriptionError(above[-1], f"<include> of '{path.name}', which includes this file")
         self.files.append(path)
-        content = read_bounded(path, "MJCF file", _LARGEST_FILE)
-        try:
-            root = ET.fromstring(content)  # fetches no external entity, refuses those that blow up
-        except (ET.ParseError, ValueError, LookupError) as error:
-            raise DescriptionError(path, f"not well-formed XML: {error}") from None
-        if root.tag not in ("mujoco", "mujocoinclude"):
-            raise DescriptionError(path, f"the root element must be <mujoco>, found <{root.tag}>")
+        root = read_xml(path, "MJCF file", "mujoco", "mujocoinclude")
         self.elements += sum(1 for _ in root.iter())
         if self.elements > _MOST_ELEMENTS or len(self.files) > _MOST_FILES:
             most = f"at most {_MOST_ELEMENTS} elements and {_MOST_FILES} files are read"

@@ -6,7 +6,9 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
+from .._files import read_file
 from ..exceptions import DescriptionError, UnknownNameError
+from ._xml import LARGEST
 from .hand import HandDescription
 from .mjcf import mjcf_files
 from .mjcf_hand import read_mjcf
@@ -121,13 +123,8 @@ def file_digests(hand: str | Path, objects: Iterable[str | Path]) -> dict[str, s
         files = [*mjcf_files(described), *([transmission] if transmission.exists() else [])]
     named = [("hand", path) for path in files]
     named += [("object", path) for item in objects for path in object_paths(item)]
-    digests = {}
-    for kind, path in named:
-        try:
-            digests[f"{kind} {path.name}"] = hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError as error:
-            raise DescriptionError(path, f"cannot be read: {error.strerror}") from None
-    return digests
+    contents = [(f"{kind} {path.name}", read_file(path, f"file of {kind}s", LARGEST)) for kind, path in named]
+    return {name: hashlib.sha256(content).hexdigest() for name, content in contents}
 
 
 def _resolve(kind: str, name: str | Path, known: dict[str, Path], endings: tuple[str, ...]) -> Path:

@@ -17,14 +17,15 @@ from typing import Any
 import numpy as np
 
 from .._extras import require
+from .._text import figure
 from ..exceptions import DescriptionError
 from ..typing import Array
-from ._toml import LARGEST_FIGURE, read_bounded
+from ._toml import LARGEST_FIGURE
+from ._xml import read_xml
 from .mimic import Mimic, read_mimics
 from .shape import Shape, merge_capsules
 
 # what no hand and no object needs: a file may be a stranger's
-_LARGEST_FILE = 4 << 20  # bytes
 _MOST = {"link": 400, "joint": 400, "collision": 2000}
 
 MOVING = ("revolute", "continuous")
@@ -127,17 +128,11 @@ def read_urdf(path: str | Path) -> UrdfModel:
         MissingExtraError: yourdfpy is not installed.
     """
     path = Path(path)
-    content = read_bounded(path, "URDF file", _LARGEST_FILE)
-    try:
-        root = ET.fromstring(content)  # fetches no external entity, refuses those that blow up
-    except (ET.ParseError, ValueError, LookupError) as error:  # also an encoding that Python does not know
-        raise DescriptionError(path, f"not well-formed XML: {error}") from None
+    root = read_xml(path, "URDF file", "robot")
     for tag, most in _MOST.items():
         there = sum(1 for _ in root.iter(tag))
         if there > most:
             raise DescriptionError(path, f"at most {most} elements <{tag}> are read, this file has {there}")
-    if root.tag != "robot":
-        raise DescriptionError(path, f"the root element must be <robot>, found <{root.tag}>")
     strict = ET.Element("robot", name=root.get("name", path.stem))
     for element in root:
         if element.tag == "link":
@@ -197,19 +192,16 @@ def _strict(path: Path, element: ET.Element, place: str, unread: tuple[str, ...]
 
 
 def _figures(path: Path, what: str, text: str, triple: bool) -> str:
-    words = text.split() if triple else [text]
-    if len(words) != (3 if triple else 1):
+    words = text.split() if triple else [text.strip()]
+    if triple and len(words) != 3:
         raise DescriptionError(path, f"{what} must be three numbers, got '{text}'")
-    for word in words:
-        try:
-            size = abs(float(word))
-        except ValueError:
-            size = math.nan
-        if not math.isfinite(size):
+    values = [figure(word) for word in words]
+    for word, value in zip(words, values, strict=True):
+        if value is None or not math.isfinite(value):
             raise DescriptionError(path, f"{what} must be a finite number, got '{word}'")
-        if size > LARGEST_FIGURE:
+        if abs(value) > LARGEST_FIGURE:
             raise DescriptionError(path, f"{what} must be at most {LARGEST_FIGURE:g} in size, got '{word}'")
-    return " ".join(repr(float(word)) for word in words)
+    return " ".join(map(repr, values))
 
 
 def _link(path: Path, link: Any) -> UrdfLink:

@@ -9,7 +9,7 @@ from typing import Any
 
 from .._checks import check_positive
 from ..description import Actuator, HandDescription, load_hand
-from ..description._toml import TomlTable, read_toml
+from ..description._toml import TomlTable, read_toml, toml_text
 from ..description.registry import HAND_FILES
 from ..exceptions import DescriptionError, ParameterError, UnknownNameError
 
@@ -148,7 +148,7 @@ class Wiring:
         """
         path = Path(path)
         data = read_toml(path, "wiring file")
-        lines = _lines(path.read_text(encoding="utf-8"))
+        lines = _lines(toml_text(path, "wiring file"))
         top = LinedTable(path, "file", data, _TABLES, {name: at.get("", 0) for name, at in lines.items()})
         head = LinedTable(path, "[hand]", data.get("hand"), _HAND, lines.get("hand", {}))
         if head.text("driver") != driver:
@@ -215,7 +215,7 @@ def driver_of(path: str | Path) -> str:
         DescriptionError: the file is missing or wrong.
     """
     data, path = read_toml(Path(path), "wiring file"), Path(path)
-    lines = _lines(path.read_text(encoding="utf-8")).get("hand", {})
+    lines = _lines(toml_text(path, "wiring file")).get("hand", {})
     return LinedTable(path, "[hand]", data.get("hand"), _HAND, lines).text("driver")
 
 

@@ -9,7 +9,7 @@ import torch
 from .._checks import check_kind
 from .._recorded import Recorded
 from ..exceptions import UnknownNameError
-from ..kinematics.grasp_state import GraspState
+from ..kinematics.grasp_state import A_STATE, GraspState
 from ..typing import Float, Tensor
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class GraspEncoding(Recorded):
         return len(self.joints) + 6
 
     def __call__(self, state: GraspState) -> Float[Tensor, "*batch n_features"]:
-        check_kind("state", state, GraspState, "a GraspState, e.g. observation.state")
+        check_kind("state", state, GraspState, A_STATE)
         dq, do, dphi = state.minus(self.reference).split([state.q.shape[-1], 3, 3], dim=-1)
         parts = dq[..., self.joints] / _Q_SCALE, do / _POSITION_SCALE, dphi / _ROTATION_SCALE
         return torch.cat(parts, dim=-1)

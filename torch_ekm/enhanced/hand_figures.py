@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import nn
 
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_kind, check_shape
 from .._recorded import Recorded
 from ..description import HandDescription
-from ..exceptions import GraspError, ParameterError
+from ..exceptions import GraspError, StateError
 from ..kinematics.play import Play, PlayState
 from ..model import Linearization
 from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
@@ -45,6 +45,10 @@ class Figure(NamedTuple):
     """Standard deviation of the factor."""
     identified: bool
     """Motions determine it; otherwise it stays where the prior and the other figures put it."""
+    described: float
+    """1; of a backlash its width [rad]."""
+    is_width: bool
+    """It is a backlash."""
 
 
 class Change(NamedTuple):
@@ -155,7 +159,7 @@ class HandFigures(ParameterFilter):
         """That they are of this hand.
 
         Raises:
-            ParameterError: another hand's, or its description has other figures.
+            StateError: another hand's, or its description has other figures.
         """
         ours = {one.label: one.nominal for one in self._entries}
         theirs = {
@@ -165,9 +169,9 @@ class HandFigures(ParameterFilter):
         other = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
         if other:
             had, has = (figures.get(other[0], "no such figure") for figures in (ours, theirs))
-            value = f"of '{self.hand}' ({_digest(ours)}): {other[0]} {had} there, {has} in the description"
-            valid = f"those of '{hand.name}' ({_digest(theirs)})"
-            raise ParameterError("knowledge", value, valid)
+            where = f"{other[0]} {had} there, {has} in the description"
+            those = f"those of '{self.hand}' ({_digest(ours)}), not of '{hand.name}' ({_digest(theirs)})"
+            raise StateError(f"the figures are {those}: {where}")
 
     @property
     def factors(self) -> Float[Tensor, " n"]:
@@ -279,6 +283,7 @@ class HandFigures(ParameterFilter):
         Raises:
             ShapeError, NonFiniteError: nothing is changed.
         """
+        check_kind("lin", lin, Linearization, "a Linearization, e.g. model.linearize(state)")
         for name, value, like in (("moved", moved, lin.manipulation_jacobian[0]),
                                   ("increment", increment, lin.manipulation_jacobian[:, 0])):  # fmt: skip
             check_shape(name, value, like.shape, "of the motors" if name == "moved" else "")
@@ -311,7 +316,9 @@ class HandFigures(ParameterFilter):
     def figures(self) -> tuple[Figure, ...]:
         """Each figure against its description."""
         std = self._prior_std * self.stddev.numpy() * np.where(self._is_play, 1.0, self._factors)
-        columns = self.names, self.factors.tolist(), std.tolist(), self._told.tolist()
+        described = np.where(self._is_play, self._described, 1.0).tolist()
+        known = self.factors.tolist(), std.tolist(), self._told.tolist()
+        columns = self.names, *known, described, self._is_play.tolist()
         return tuple(Figure(*row) for row in zip(*columns, strict=True))
 
     @property
@@ -346,9 +353,9 @@ class HandFigures(ParameterFilter):
         figures = self.figures
         lines = [
             f"{one.name}: {math.degrees(one.factor):.2f} deg, +-{math.degrees(one.std):.2f}"
-            if play
+            if one.is_width
             else f"{one.name}: {one.factor:.2f} times the description, +-{one.std:.2f}"
-            for one, play in zip(figures, self._is_play.tolist(), strict=True)
+            for one in figures
             if one.identified
         ]
         rest = [one.name for one in figures if not one.identified]

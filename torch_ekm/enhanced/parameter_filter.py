@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import nn
 
 from .._checks import check_finite, check_shape
-from .._recorded import Recorded
+from .._recorded import Recorded, bound_problems, covariance_problems
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
 
@@ -170,17 +170,21 @@ class ParameterFilter(Recorded, nn.Module):
         bounded = tuple(self.names[i] for i in np.flatnonzero(wanted != mean))
         return FilterReport(surprise, weight, opened, bounded)
 
-    def state_problems(self, state: dict[str, Tensor]) -> list[str]:
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
         """What is wrong with the entries of a state that is to be loaded."""
-        wrong = []
+        count, wrong = int(state["count"]), []
         for name in ("covariance", "before_covariance"):
-            P = state.get(name)
-            if P is not None and float(torch.linalg.eigvalsh(P)[0]) <= 0:
-                wrong.append(f"{name} is no covariance")
-        mean = state.get("mean")
-        if mean is not None and bool(((mean < self.lower) | (mean > self.upper)).any()):
-            wrong.append("mean is out of bounds")
-        return wrong
+            wrong += covariance_problems(name, state[name], self.prior.diagonal())
+        for name in ("mean", "before"):
+            if bool(((state[name] < self.lower) | (state[name] > self.upper)).any()):
+                wrong.append(f"{name} is out of bounds")
+        if not count and not torch.equal(state["mean"], self.start.to(state["mean"])):
+            wrong.append("mean is not the start, and no motion was learned")
+        most = (1 + _RECENT * (_SURPRISE - 1)) ** min(
+            count, 5000
+        )  # what so many surprises in succession make
+        surprises = 0, _IN_A_ROW - 1
+        return wrong + bound_problems(state, usual=(0, most), surprises=surprises, changed_at=(-1, count))
 
     def extra_repr(self) -> str:
         return f"parameters={len(self)}, motions={int(self.count)}"

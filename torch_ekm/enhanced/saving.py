@@ -50,8 +50,7 @@ def load(
         The ResidualLearner or EnhancedModel.
 
     Raises:
-        FileNotFoundError: there is no file.
-        FileFormatError: :func:`save` has not written it, or it is damaged.
+        FileFormatError: there is no such file, :func:`save` has not written it, or it is damaged.
         StateMismatchError: state and description do not go together.
         ParameterError: a class is not known, or f is missing (or given for a learner).
     """

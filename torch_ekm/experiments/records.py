@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ..control import Manipulation, StoppingRule, StopReason
-from ..exceptions import ParameterError
+from ..exceptions import StateError
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Float, Tensor
@@ -115,15 +115,15 @@ class TrialRecord(Trial):
         """The record that :meth:`to_json` wrote.
 
         Raises:
-            ParameterError: a figure is missing, or there is one that the record does not have.
+            StateError: a figure is missing, or there is one that the record does not have.
         """
         given: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in figures.items()}
         kind = cls if given.pop("grasped", False) else NotGrasped
         known = {field.name for field in dataclasses.fields(kind)}
         if known != set(given):
             wrong = ", ".join(sorted(known ^ set(given)))
-            valid = f"exactly the figures of {kind.__name__}; remove results of another version"
-            raise ParameterError("record", f"missing or unknown: {wrong}", valid)
+            told = f"missing or unknown: {wrong}; remove results of another version"
+            raise StateError(f"the record has not the figures of {kind.__name__}: {told}")
         return kind(**given)
 
     @classmethod

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..description import HandDescription
-from ..exceptions import ParameterError
+from ..exceptions import StateError
 from ..kinematics import ServoModel
 from ..plant import PlantStatus, Trajectory
 from ..typing import Array
@@ -52,7 +52,7 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
         trials: number and log, in order.
 
     Raises:
-        ParameterError: a log is of another hand.
+        StateError: a log is of another hand.
     """
     names = hand.actuator_names
     watches = {(name, part): _Watch(part) for name in names for part in _PRIORS}
@@ -84,8 +84,8 @@ def _motions(
             continue
         a, q = (np.stack([getattr(one, name).numpy() for one in log.observations]) for name in "aq")
         if (q.shape[1], a.shape[1]) != (hand.n_q, hand.n_a):
-            valid = f"that of '{hand.name}', with {hand.n_q} joints and {hand.n_a} actuators"
-            raise ParameterError(f"trial {trial}", f"{q.shape[1]} joints, {a.shape[1]} actuators", valid)
+            ours = f"'{hand.name}' has {hand.n_q} and {hand.n_a}"
+            raise StateError(f"trial {trial} is of {q.shape[1]} joints and {a.shape[1]} actuators, {ours}")
         v, w = np.stack([one.numpy() for one in log.commands]), np.diff(a, axis=0)
         pulled, s = np.diff(q, axis=0) @ hand.actuation_jacobian.T, np.sign(v)
         moved = (np.abs(v) > ServoModel.resolution) & (a[1:] > low) & (a[1:] < high)

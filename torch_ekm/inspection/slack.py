@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from .._files import write_whole
+from ..description._toml import toml_text
 from ..drivers import HandDriver, Wiring
 from ..exceptions import DescriptionError, DeviceError
 from .identify_servo import nearest_column
@@ -66,7 +67,7 @@ def write_zeros(wiring: Wiring, found: list[Taut]) -> None:
         DescriptionError: a motor's table is not found in it.
         OutputError: it cannot be written.
     """
-    lines = wiring.path.read_text(encoding="utf-8").splitlines()
+    lines = toml_text(wiring.path, "wiring file").splitlines()
     for number, one in sorted(
         ((wiring.line("motors", one.motor, "zero"), one) for one in found), reverse=True
     ):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .._extras import require
-from ..exceptions import ParameterError
+from ..exceptions import ParameterError, StateError
 from ..residual import MixtureResidual, ResidualLearner, SparseOnlineGP
 from ..residual.base import FARTHEST
 from ..typing import Array
@@ -40,7 +40,9 @@ class CasadiResidual:
 
     def __init__(self, learner: ResidualLearner, *, variance: bool = True) -> None:
         if tuple(learner.batch_shape):
-            raise ParameterError("learner", f"a fleet {tuple(learner.batch_shape)}", "one model")
+            raise StateError(
+                f"the learner is a fleet {tuple(learner.batch_shape)}; one model can be exported"
+            )
         self.learner, self._inputs = learner, Inputs()
         x = ca.SX.sym("x", learner.in_features)
         mean, spread = _build(learner, self._inputs, variance)(x)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch.distributions import Normal
 
-from ..exceptions import ParameterError
+from ..exceptions import ParameterError, StateError
 from ..residual import ResidualLearner, default_learner
 from ..typing import Array
 
@@ -69,7 +69,7 @@ def make_learner(learner: LearnerLike, in_features: int, out_features: int) -> R
     """A fresh learner of these sizes: a copy of the one given, or what the factory makes.
 
     Raises:
-        ParameterError: it has other sizes, or is a fleet.
+        StateError: it has other sizes, or is a fleet.
     """
     if isinstance(learner, ResidualLearner):
         made = copy.deepcopy(learner)
@@ -78,6 +78,8 @@ def make_learner(learner: LearnerLike, in_features: int, out_features: int) -> R
         made = (learner or own)(in_features, out_features)
     sizes = made.in_features, made.out_features, tuple(made.batch_shape)
     if sizes != (in_features, out_features, ()):
-        valid = f"one model of {in_features} inputs and {out_features} outputs"
-        raise ParameterError("learner", f"{sizes[0]} inputs, {sizes[1]} outputs, fleet {sizes[2]}", valid)
+        needed = f"needed is one model of {in_features} inputs and {out_features} outputs"
+        raise StateError(
+            f"the learner has {sizes[0]} inputs, {sizes[1]} outputs, batch shape {sizes[2]}; {needed}"
+        )
     return made

@@ -12,12 +12,13 @@ from dataclasses import dataclass
 import torch
 
 from .._arrays import is_plain
-from .._checks import check_finite
+from .._checks import check_finite, check_kind
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .se3 import cross, exp, log
 from .tensors import as_tensors
 
+A_STATE = "a GraspState, e.g. observation.state"
 _ROUNDED = 1e-4
 """What a rotation matrix may be off by, entry by entry: four digits are enough, a scale or a shear is not."""
 
@@ -62,14 +63,15 @@ class GraspState:
 
     def plus(self, ds: Float[Tensor, "*batch n_s"]) -> GraspState:
         """Retraction: ``q + dq``, ``o + do``, ``exp([dphi]x) R``."""
-        n_q = self.q.shape[-1]
-        if ds.shape[-1] != n_q + 6:
+        (ds,), n_q = as_tensors(ds=ds), self.q.shape[-1]
+        if ds.shape[-1:] != (n_q + 6,):
             raise ShapeError("ds", f"(*batch, {n_q + 6})", ds.shape, "it is [dq; do; dphi]")
         dq, do, dphi = ds.split([n_q, 3, 3], dim=-1)
         return GraspState(self.q + dq, self.position + do, exp(dphi) @ self.rotation)
 
     def minus(self, earlier: GraspState) -> Float[Tensor, "*batch n_s"]:
         """``ds`` with ``earlier.plus(ds) = self``: ``[q+ - q; o+ - o; Log(R+ R^T)]``."""
+        check_kind("state", earlier, GraspState, A_STATE)
         dphi = log(self.rotation @ earlier.rotation.mT)
         return torch.cat([self.q - earlier.q, self.position - earlier.position, dphi], dim=-1)
 

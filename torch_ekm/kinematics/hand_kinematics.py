@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from .._arrays import is_plain
+from .._checks import check_kind
 from .._extras import require
 from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError, UnknownNameError
@@ -93,7 +94,7 @@ class HandKinematics(nn.Module):
             ShapeError: the last dimension is not ``n_q``; the message lists the joints in order.
             ParameterError: ``q`` has another dtype than this module.
         """
-        shape, n_q = q.shape, len(self.joint_names)
+        shape, n_q = check_kind("q", q, Tensor, "a tensor: torch.as_tensor(q)").shape, len(self.joint_names)
         if not shape or shape[-1] != n_q:
             joints = ", ".join(self.joint_names)
             raise ShapeError("q", f"(*batch, {n_q})", shape, f"the joints are, in order: {joints}")

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,14 +13,16 @@ from numpy.typing import NDArray
 from torch import nn
 
 from .._checks import check_finite, check_shape
-from .._recorded import Recorded
+from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Bool, Float, Tensor
 
 Mask = NDArray[np.bool_]
 _DEG = math.pi / 180
 _PRIOR_STD = (1.0 * _DEG, 0.3 * _DEG)  # [rad] of d and b before the first motion
 _NOISE_STD = 0.1 * _DEG  # [rad] of a servo's error from motion to motion, a first guess worth ten motions
+_LEAST_STD = 1e-6  # [rad] of that error: no encoder is better
 _FORGETTING = 0.995  # of the least squares, for each motion
+_WEIGHTS = 10.0, 1 / (1 - _FORGETTING)  # of the noise's estimate, first and at last
 
 
 class IdealServos(Recorded, nn.Module):
@@ -40,6 +43,10 @@ class IdealServos(Recorded, nn.Module):
     def command(self, wanted: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """v = w: the increments that are wanted, unchanged [rad]."""
         return wanted
+
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the entries of a state that is to be loaded."""
+        return ["stuck: ideal servos are not"] if bool(state["stuck"].any()) else []
 
     def update(self, command: Tensor, moved: Tensor, free: Tensor | None = None) -> None:
         """Does nothing: ideal servos have neither dead zone nor bias to be learned."""
@@ -73,7 +80,7 @@ class ServoModel(Recorded, nn.Module):
     resolution = 0.02 * _DEG
     """Wanted motions up to this size are none [rad]."""
     largest = 6 * _DEG
-    """No dead zone is larger [rad]."""
+    """No dead zone, bias or error of a motion is larger [rad]."""
 
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__()
@@ -82,7 +89,7 @@ class ServoModel(Recorded, nn.Module):
         n = len(self.names)
         self.estimate = nn.Buffer(torch.zeros(n, 2).double())  # theta = (d, b) [rad]
         self.covariance = nn.Buffer(self._prior.repeat(n, 1, 1))  # of theta, in units of the noise's variance
-        self.weight = nn.Buffer(torch.full((n,), 10.0).double())
+        self.weight = nn.Buffer(torch.full((n,), _WEIGHTS[0]).double())
         self.squares = nn.Buffer(self.weight * _NOISE_STD**2)
         self.before = nn.Buffer(self.estimate.clone())  # theta before the first failure in succession
         self.before_covariance = nn.Buffer(self.covariance.clone())
@@ -99,7 +106,8 @@ class ServoModel(Recorded, nn.Module):
     def bias(self) -> Float[Tensor, " n_a"]:
         """b [rad]: the most probable one with ``d >= 0``."""
         negative = self.estimate[:, 0].clamp(max=0.0)  # what d gives up, b takes over as they are correlated
-        return self.estimate[:, 1] - self.covariance[:, 1, 0] / self.covariance[:, 0, 0] * negative
+        bias = self.estimate[:, 1] - self.covariance[:, 1, 0] / self.covariance[:, 0, 0] * negative
+        return bias.clamp(-self.largest, self.largest)
 
     @property
     def noise_std(self) -> Float[Tensor, " n_a"]:
@@ -153,6 +161,19 @@ class ServoModel(Recorded, nn.Module):
         lost = stood & (at.estimate[:, 0] > self.largest)
         at.stuck[lost] = True
         at.estimate[lost], at.covariance[lost] = at.before[lost], at.before_covariance[lost]
+        np.clip(at.estimate, -self.largest, self.largest, out=at.estimate)
+
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the entries of a state that is to be loaded."""
+        angle, variance = (-self.largest, self.largest), state["squares"] / state["weight"]
+        wrong = bound_problems(state, estimate=angle, before=angle, weight=_WEIGHTS, surprises=(0, 1))
+        if not bool(((variance >= 0.99 * _LEAST_STD**2) & (variance <= self.largest**2)).all()):
+            wrong.append("squares: a servo's error is none, or larger than its largest dead zone")
+        if bool((state["stuck"] & (state["failures"] == 0)).any()):
+            wrong.append("stuck: a servo that never failed to move")
+        for name in ("covariance", "before_covariance"):
+            wrong += covariance_problems(name, state[name], self._prior.diagonal())
+        return wrong
 
     def _regress(self, at: SimpleNamespace, v: Array, w: Array, went: Mask) -> None:
         """``v - w = x.theta + noise``, ``x = [sign(w), -1]``, of the servos that moved."""
@@ -168,7 +189,7 @@ class ServoModel(Recorded, nn.Module):
         small = (faded[:, [0, 1], [0, 1]] <= self._prior.diagonal().numpy()).all(-1)
         at.covariance[went] = np.where(small[:, None, None], faded, P)
         # bounded: a servo that has become another one is not a noisy one
-        square = np.minimum(error**2 / spread, 16 * noise)
+        square = np.clip(error**2 / spread, _LEAST_STD**2, np.minimum(16 * noise, self.largest**2))
         at.weight[went] = _FORGETTING * at.weight[went] + 1
         at.squares[went] = _FORGETTING * at.squares[went] + square
 

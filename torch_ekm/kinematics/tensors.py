@@ -22,6 +22,8 @@ def as_tensors(**values: object) -> list[Tensor]:
         return tensors
     try:
         given = [torch.as_tensor(v).dtype if hasattr(v, "dtype") else torch.float64 for v in values.values()]
+        if any(dtype.is_complex for dtype in given):
+            raise TypeError("not complex")
         wide = [dtype if dtype.is_floating_point else torch.float64 for dtype in given]
         dtype = functools.reduce(torch.promote_types, wide)
         return [torch.as_tensor(value, dtype=dtype) for value in values.values()]

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 
 from .._arrays import like, namespace
+from .._checks import check_kind
 from ..contact.contact_set import ContactSet
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
@@ -41,6 +42,8 @@ def check_state(
     hand: HandDescription, state: GraspState, contacts: ContactSet | None, dtype: torch.dtype
 ) -> None:
     """One entry for each joint, contacts with a batch of states, everything in the model's precision."""
+    if contacts is not None:
+        check_kind("contacts", contacts, ContactSet, "a ContactSet, e.g. model.contacts(state)")
     if state.q.shape[-1] != hand.n_q:
         names = ", ".join(hand.joint_names)
         raise ShapeError("q", f"(*batch, {hand.n_q})", state.q.shape, f"the joints are: {names}")

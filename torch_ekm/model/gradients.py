@@ -17,13 +17,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from .._checks import check_kind
 from .._extras import require
 from ..contact.contact_set import VARYING, ContactSet
 from ..contact.forces.balance import BalanceEquations, ForceSolution
 from ..contact.forces.options import ForceOptions
 from ..contact.forces.problem import force_cost, force_problem
 from ..exceptions import NoContactError
-from ..kinematics.grasp_state import GraspState
+from ..kinematics.grasp_state import A_STATE, GraspState
 from ..typing import Float, Tensor
 
 _NEAR = 1e-3  # [N] constraints with less room may be active: an interior-point method stays off them a little
@@ -36,6 +37,7 @@ def only_if_asked(method: Callable[..., Any]) -> Any:
 
     @functools.wraps(method)
     def wrapped(self: Any, state: GraspState, *args: Any, **kwargs: Any) -> Any:
+        check_kind("state", state, GraspState, A_STATE)
         figures = self.spring_stiffness, self.spring_rest, *self.reduction.drives, self.weight, self.com
         given = *figures, state.q, state.position, state.rotation
         with torch.set_grad_enabled(torch.is_grad_enabled() and any(x.requires_grad for x in given)):

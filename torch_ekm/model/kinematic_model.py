@@ -8,12 +8,13 @@ import torch
 from torch import nn
 
 from .._arrays import in_numpy, is_plain, like, namespace
+from .._checks import check_kind
 from ..contact.contact_kinematics import ContactKinematics, constraint_matrix, contact_kinematics
 from ..contact.contact_set import ContactSet, Detector
 from ..contact.detector import ContactDetector
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError
-from ..kinematics.grasp_state import GraspState
+from ..kinematics.grasp_state import A_STATE, GraspState
 from ..kinematics.hand_kinematics import HandKinematics
 from ..kinematics.link_poses import Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
@@ -158,7 +159,7 @@ class KinematicModel(nn.Module):
         Raises:
             NoContactError: nothing touches the object.
         """
-        return self._detect(state, None)
+        return self._detect(check_kind("state", state, GraspState, A_STATE), None)
 
     def _detect(self, state: GraspState, poses: LinkPoses | None) -> ContactSet:
         detector, place = self.detector, (state.position, state.rotation)

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from ..exceptions import ParameterError
+from ..exceptions import StateError
 from ..typing import Float, Tensor
 from .observation import Observation
 from .trajectory import Trajectory
@@ -12,12 +12,12 @@ class ReplayedPlant:
     A driver of a real hand has the same methods: send the increment, wait until it is done, read the sensors.
 
     Raises:
-        ParameterError: the trajectory is empty.
+        StateError: the trajectory is empty.
     """
 
     def __init__(self, trajectory: Trajectory) -> None:
         if not trajectory.observations:
-            raise ParameterError("trajectory", "empty", "one with at least one observation")
+            raise StateError("the trajectory is empty: it has no observation to begin with")
         self.trajectory = trajectory
         self._place = 0
 
@@ -34,11 +34,10 @@ class ReplayedPlant:
         """The next observation.
 
         Raises:
-            ParameterError: the trajectory ends here.
+            StateError: the trajectory ends here.
         """
         if self._place >= len(self.trajectory.commands):
-            valid = f"at most {len(self.trajectory.commands)}: the recording ends there"
-            raise ParameterError("command", self._place + 1, valid)
+            raise StateError(f"the recording ends after {self._place} commands; reset() begins again")
         self._place += 1
         return self.observe()
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..exceptions import DescriptionError, ParameterError
+from .._files import told_as_damage
+from ..exceptions import ParameterError, StateError
 from ..typing import Tensor
 from .observation import Observation, PlantStatus, Stamps, Truth
 from .trial_file import read_trial, write_trial
@@ -44,7 +45,8 @@ class Trajectory:
 
         Raises:
             ParameterError: ``about`` is nothing that JSON can hold, or the forces or an array of ``info``
-                change their shape or come and go; nothing is written.
+                change their shape; nothing is written.
+            StateError: they come and go; nothing is written.
             OutputError: the file cannot be written.
         """
         path = Path(path)
@@ -60,10 +62,8 @@ class Trajectory:
         """
         path = Path(path)
         seed, about, arrays = read_trial(path)
-        try:
+        with told_as_damage(path, "recording"):  # its digest is right and its contents are not: nobody's
             return cls.from_arrays(seed, about, arrays)
-        except Exception as error:  # its digest is right and its contents are not: nobody's recording
-            raise DescriptionError(path, f"damaged recording: {type(error).__name__}: {error}") from None
 
     @classmethod
     def from_arrays(cls, seed: int, about: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Trajectory:
@@ -97,7 +97,8 @@ class Trajectory:
         """Everything but seed and ``about``, by its place in the file; see :meth:`from_arrays`.
 
         Raises:
-            ParameterError: the forces or an array of ``info`` change their shape or come and go.
+            ParameterError: the forces or an array of ``info`` change their shape.
+            StateError: they come and go.
         """
         seen = self.observations
         events = [json.dumps([str(event) for event in o.info.get("events", ())]).encode() for o in seen]
@@ -119,7 +120,9 @@ class Trajectory:
             for name in sorted({name for values in named for name in values}):
                 place = f"{group}/{name}" if group else name
                 if not all(name in values for values in named):
-                    raise ParameterError(place, "missing in some observations", "there in all, or in none")
+                    raise StateError(
+                        f"{place} is missing in some observations; it must be in all, or in none"
+                    )
                 arrays[place] = _stack(place, [values[name] for values in named])
         return arrays
 

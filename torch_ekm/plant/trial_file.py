@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import re
-import stat
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from .._extras import require
-from .._files import write_whole
+from .._files import check_announced, opened, told_as_damage, write_whole
 from ..exceptions import DescriptionError
 
 FORMAT = "torch_ekm trial 2"
-_LARGEST = 4 << 30  # bytes of all arrays of a trial: a small file can claim any size
+_LARGEST = 4 << 30  # bytes
+_KINDS = "biufS"
 _HEAD = 512  # bytes: the block that HDF5 leaves to its user (its smallest size)
 _LINE = re.compile(f"{FORMAT}\nsha256 ([0-9a-f]{{64}})\n".encode())
 
@@ -51,46 +51,36 @@ def read_trial(
     Raises:
         DescriptionError: no such file, no recording, or a damaged one.
     """
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise DescriptionError(path, "no recording: it is no file but a folder, a pipe or a device")
-        if status.st_size > _LARGEST:
-            raise DescriptionError(path, f"more than {_LARGEST} bytes")
-        content = bytearray(path.read_bytes())
-    except FileNotFoundError:
-        raise DescriptionError(path, "no such recording") from None
-    except OSError as error:
-        raise DescriptionError(path, f"cannot be read: {error.strerror}") from None
-    head = _LINE.match(content)
-    if head is None:
-        first = f"a recording starts with a line '{FORMAT}', which this file does not"
-        raise DescriptionError(path, f"damaged, or not a recording of this version of torch_ekm: {first}")
-    written_digest = head[1].decode()
-    whole = content[:_HEAD] == _head(written_digest)
-    content[:_HEAD] = _head("0" * 64)
-    if not whole or hashlib.sha256(content).hexdigest() != written_digest:
-        raise DescriptionError(path, "damaged: its bytes are not those that were written (SHA-256)")
-    h5py = require("h5py")
-    try:
-        with h5py.File(io.BytesIO(content), "r") as file:
-            arrays: dict[str, np.ndarray] = {}
+    with opened(path, "recording", _LARGEST) as content:
+        head = _LINE.match(first := content.read(_HEAD))
+        if head is None:
+            problem = f"a recording starts with a line '{FORMAT}', which this file does not"
+            raise DescriptionError(
+                path, f"damaged, or not a recording of this version of torch_ekm: {problem}"
+            )
+        digest = hashlib.sha256(_head("0" * 64))
+        hashlib.file_digest(content, lambda: digest)
+        if first != _head(head[1].decode()) or digest.hexdigest() != head[1].decode():
+            raise DescriptionError(path, "damaged: its bytes are not those that were written (SHA-256)")
+        h5py, arrays = require("h5py"), {}
+        with told_as_damage(path, "recording"), h5py.File(content, "r") as file:
 
             def take(place: str, item: Any) -> None:
                 if not isinstance(item, h5py.Dataset) or not wanted(place):
                     return
                 if item.external or item.is_virtual:
                     raise DescriptionError(path, f"'{place}' lies in another file")
-                if sum(array.nbytes for array in arrays.values()) + item.nbytes > _LARGEST:
-                    raise DescriptionError(path, f"more than {_LARGEST} bytes of arrays")
+                if item.dtype.kind not in _KINDS:  # of other kinds a byte there may stand for any number
+                    raise DescriptionError(path, f"'{place}' holds {item.dtype}, no figures")
+                announced = sum(array.nbytes for array in arrays.values()) + item.nbytes
+                check_announced(path, announced, path.stat().st_size)
                 arrays[place] = item[()]
 
             file.visititems(take)
-            return int(file.attrs["seed"]), json.loads(file.attrs["about"]), arrays
-    except DescriptionError:
-        raise
-    except Exception as error:  # a file that was made to look right fails in any way HDF5 can think of
-        raise DescriptionError(path, f"damaged recording: {type(error).__name__}: {error}") from None
+            seed, about = int(file.attrs["seed"]), json.loads(file.attrs["about"])
+            if not isinstance(about, dict):
+                raise DescriptionError(path, "damaged recording: what it says about itself is no table")
+            return seed, about, arrays
 
 
 def _head(digest: str) -> bytes:

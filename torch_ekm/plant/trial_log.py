@@ -10,10 +10,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .._files import WriterLock, make_folder, told_as_output_error, write_whole
+from .._files import WriterLock, make_folder, told_as_damage, told_as_output_error, write_whole
 from .._versions import versions_of
 from .._warnings import warn
-from ..exceptions import DescriptionError, OutputError, ParameterError
+from ..exceptions import DescriptionError, OutputError, ParameterError, StateError
 from .trajectory import Trajectory, plain
 from .trial_file import read_trial
 
@@ -143,13 +143,15 @@ class TrialLog:
         """Keep a finished trial; ``outcome`` says what came of it (no wall-clock times).
 
         Raises:
-            ParameterError: there is such a trial already, ``outcome`` is nothing that JSON can hold, or the
-                log was opened to be read, or closed.
+            ParameterError: there is such a trial already, or ``outcome`` is nothing that JSON can hold.
+            StateError: the log was opened to be read, or is closed.
             OutputError: the trial cannot be written, and the log is what it was; or the index cannot: the
                 trial is then kept, and the next run writes the index.
         """
         if self._lock is None:
-            raise ParameterError("log", str(self.folder), "opened with TrialLog(folder, configuration)")
+            raise StateError(
+                f"the log {self.folder} is closed, or opened to be read: TrialLog(folder, configuration)"
+            )
         if trial < 0 or trial in self:
             raise ParameterError("trial", trial, "0 or more, and not in the log yet")
         about = {
@@ -218,10 +220,8 @@ def read_entry(folder: Path, trial: int) -> tuple[TrialEntry, dict[str, Any]]:
     if about.get("trial", trial) != trial:
         raise DescriptionError(path, f"holds trial {about['trial']!r}")
     configuration = about.get("configuration", {})
-    try:
+    with told_as_damage(path, "trial"):
         return _entry(trial, seed, about, arrays), dict(configuration)
-    except (AttributeError, KeyError, TypeError, ValueError, UnicodeDecodeError) as error:
-        raise DescriptionError(path, f"no trial: {type(error).__name__}: {error}") from None
 
 
 def index_lines(entries: Mapping[int, TrialEntry]) -> bytes:

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from .._files import read_file
 from ..description.registry import file_digests
-from ..exceptions import EKMError, ParameterError
+from ..exceptions import DescriptionError, EKMError, StateError
 from .trajectory import Trajectory
 from .trial_log import (
     DAMAGED,
@@ -19,6 +20,8 @@ from .trial_log import (
     trial_path,
     trials_in,
 )
+
+_LARGEST_INDEX = 64 << 20  # bytes
 
 
 class Finding(NamedTuple):
@@ -57,7 +60,7 @@ def verify_log(folder: str | Path) -> list[Finding]:
             check_configuration(shared, configuration, folder)
             if len(recording.observations) not in (len(recording.commands) + 1, 0):
                 sizes = f"{len(recording.commands)} commands and {len(recording.observations)} observations"
-                raise ParameterError("recording", sizes, "one observation more than commands")
+                raise StateError(f"{sizes}; there must be one observation more than commands")
             entries[trial] = entry
             what = f"{entry.commands} commands, {entry.reason or entry.status}"
             found.append(Finding(path.name, "ok", what))
@@ -71,8 +74,8 @@ def verify_log(folder: str | Path) -> list[Finding]:
 
 def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Finding:
     try:
-        written = (folder / INDEX).read_bytes()
-    except OSError:
+        written = read_file(folder / INDEX, "index", _LARGEST_INDEX)
+    except DescriptionError:
         return Finding(INDEX, "wrong", "missing; the next run makes it from the files")
     right = index_lines(entries)
     if written == right:

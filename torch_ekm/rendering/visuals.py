@@ -13,7 +13,10 @@ from typing import Any, cast
 import numpy as np
 
 from .._extras import require
+from .._files import check_file
+from .._text import figure
 from ..description import Shape
+from ..description._xml import read_xml
 from ..description.shape import Kind, merge_capsules
 from ..description.urdf import UrdfModel
 from ..typing import Array
@@ -72,7 +75,7 @@ def _read(
     path: Path, changed: int
 ) -> tuple[dict[tuple[str, str], tuple[Shape | Mesh, ...]], tuple[str, ...]]:
     """(link, tag) -> its parts, none where one of them cannot be read; and why not."""
-    root = ET.fromstring(path.read_bytes())
+    root = read_xml(path, "URDF file", "robot")
     drawn, problems, left = {}, [], _MOST
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -120,8 +123,7 @@ def _load(urdf: Path, name: str) -> Any:
         raise ValueError(f"the mesh '{name}' is not there")
     if file.suffix.lower() not in _SUFFIXES:
         raise ValueError(f"a mesh of kind '{file.suffix}' is not drawn; {', '.join(_SUFFIXES)} are")
-    if file.stat().st_size > _LARGEST_FILE:
-        raise ValueError(f"the mesh '{name}' has more than {_LARGEST_FILE >> 20} MiB")
+    check_file(file, "mesh", _LARGEST_FILE)
     trimesh = require("trimesh")
     try:
         mesh = trimesh.load(str(file), force="mesh", process=False, skip_materials=True)
@@ -143,7 +145,7 @@ def _find(urdf: Path, name: str) -> Path | None:
 
 
 def _numbers(text: str, n: int) -> list[float]:
-    values = [float(word) for word in text.split()]
-    if len(values) != n or not all(map(math.isfinite, values)):
+    values = [value for value in map(figure, text.split()) if value is not None and math.isfinite(value)]
+    if len(values) != n or len(text.split()) != n:
         raise ValueError(f"needs {n} finite numbers, got '{text}'")
     return values

@@ -20,7 +20,7 @@ from torch.distributions import Distribution, Normal
 
 from .._checks import check_count, check_counts, check_finite
 from .._recorded import Recorded, check_state, describe
-from ..exceptions import ParameterError, ShapeError
+from ..exceptions import ParameterError, ShapeError, StateError
 from ..typing import Bool, Float, Tensor
 from .report import UpdateReport
 
@@ -223,7 +223,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
         Raises:
             ShapeError: a shape does not fit. The state is untouched.
-            ParameterError: x, y or mask are no numbers, or the learner was made within inference mode.
+            ParameterError: x, y or mask are no numbers.
+            StateError: the learner was made within inference mode.
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
@@ -232,7 +233,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
     def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if self._like.is_inference():  # torch refuses to change these later on
-            raise ParameterError("learner", "made within torch.inference_mode()", "made outside of it")
+            raise StateError("the learner was made within torch.inference_mode(); make it outside")
         x, y = self._cast(x).detach(), self._cast(y, "y").detach()
         if self.out_features == 1 and y.shape == x.shape[:-1]:
             y = y.unsqueeze(-1)

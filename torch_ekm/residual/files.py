@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import math
 import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,14 +15,19 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map_only
 
-from .._files import write_whole
+from .._files import check_announced, opened, told_as_damage, write_whole
 from .._recorded import Recorded, check_state, make, opaque_arguments
-from ..exceptions import EKMError, FileFormatError, NoStateError
+from ..exceptions import FileFormatError, NoStateError
 
 _FORMAT = "torch_ekm learner 1"
 _HEADER = "header.json"
-_LARGEST_HEADER = 10_000_000  # bytes
+_LARGEST = 4 << 30  # bytes
+_LARGEST_HEADER = 10_000_000
+_MOST_OBJECTS = 2000  # that a learner is made of
+_MOST_CHOICES = 10_000  # of an object: the product of the lengths of its lists
 
 
 def write(path: str | os.PathLike, described: Mapping[str, Any], state: Mapping[str, Any]) -> None:
@@ -59,33 +66,38 @@ def read(path: str | os.PathLike) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         FileFormatError: it is no such file, or damaged.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
+    with (
+        opened(path, "file of a learner", _LARGEST, FileFormatError) as file,
+        told_as_damage(path, "file", FileFormatError),
+    ):
+        try:
+            archive = zipfile.ZipFile(file)
+        except zipfile.BadZipFile:
+            raise FileFormatError(path, "not written by torch_ekm.save, or cut short") from None
+        with archive:
             entries = archive.infolist()
             if _HEADER not in archive.namelist():
                 raise FileFormatError(path, "not written by torch_ekm.save")
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
                 raise FileFormatError(path, "compressed entries, which no learner's file has")
+            if sum(entry.file_size for entry in entries) > os.fstat(file.fileno()).st_size:
+                raise FileFormatError(path, "entries that are larger than the file")
             if archive.getinfo(_HEADER).file_size > _LARGEST_HEADER:
                 raise FileFormatError(path, "a header that is too large")
             header = json.loads(archive.read(_HEADER))
             if not isinstance(header, dict) or header.get("format") != _FORMAT:
                 raise FileFormatError(path, f"not a file of format '{_FORMAT}'")
-            tensors = {}
-            for entry in entries:
-                if entry.filename != _HEADER:
-                    with archive.open(entry) as file:
-                        array = np.lib.format.read_array(file, allow_pickle=False)
-                    if array.nbytes > entry.file_size:
-                        raise FileFormatError(path, f"'{entry.filename}' is larger than the file says")
-                    tensors[entry.filename] = torch.from_numpy(array.copy())
+            tensors = {one.filename: _array(archive.read(one)) for one in entries if one.filename != _HEADER}
             return header["made_with"], {name: _unpack(one, tensors) for name, one in header["state"].items()}
-    except (OSError, EKMError):
-        raise
-    except zipfile.BadZipFile:
-        raise FileFormatError(path, "not written by torch_ekm.save, or cut short") from None
-    except Exception as error:  # whatever a damaged file makes of zip, JSON and npy
-        raise FileFormatError(path, f"cannot be read ({type(error).__name__}: {error})") from None
+
+
+def _array(entry: bytes) -> torch.Tensor:
+    """Of ``.npy``, whose header cannot announce more than there is."""
+    file = io.BytesIO(entry)
+    np.lib.format.read_magic(file)
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    figures = np.frombuffer(entry, dtype, offset=file.tell())
+    return torch.from_numpy(figures.reshape(shape, order="F" if fortran else "C").copy())
 
 
 def rebuild(
@@ -97,17 +109,51 @@ def rebuild(
         FileFormatError: it cannot be made.
         StateMismatchError: the state is not one of it.
     """
-    try:
+    there = sum(one.nbytes for one in state.values() if isinstance(one, torch.Tensor))
+    with told_as_damage(path, "description", FileFormatError), _Sized(path, there):
+        if _objects(described) > _MOST_OBJECTS:
+            raise FileFormatError(path, f"more than {_MOST_OBJECTS} objects, or choices without number")
         made = make(described, known)
-    except EKMError:
-        raise
-    except Exception as error:
-        raise FileFormatError(path, f"describes nothing that can be made ({error})") from None
     if not isinstance(made, nn.Module):
         raise FileFormatError(path, "describes no learner")
     check_state(made, state)
     made.load_state_dict(state)
     return made
+
+
+def _objects(described: Any) -> int:
+    """How many a description makes; one with too many choices counts for all."""
+    if not isinstance(described, dict | list):
+        return 0
+    inside = list(described.values()) if isinstance(described, dict) else described
+    lengths = (len(one) for one in inside if isinstance(one, list) and one)
+    many = isinstance(described, dict) and math.prod(lengths) > _MOST_CHOICES
+    own = isinstance(described, dict) and "class" in described
+    return own + many * (_MOST_OBJECTS + 1) + sum(map(_objects, inside))
+
+
+class _Sized(TorchDispatchMode):
+    """What is made takes memory that goes with its state: a result's size is known before it is there.
+
+    Raises:
+        FileFormatError: it takes more than 64 MiB, and 8 times the state.
+    """
+
+    def __init__(self, path: str | os.PathLike, there: int) -> None:
+        super().__init__()
+        self._path, self._there, self._taken = path, there, 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        if all(one.alias_info is None for one in func._schema.returns):  # no view, nothing in place
+            with contextlib.suppress(RuntimeError):  # of what depends on data, and makes nothing large
+                plan_args, plan = tree_map_only(torch.Tensor, lambda x: x.to("meta"), (args, kwargs))
+                if "device" in plan:
+                    plan["device"] = torch.device("meta")
+                made = tree_leaves(func(*plan_args, **plan))
+                self._taken += sum(one.nbytes for one in made if isinstance(one, torch.Tensor))
+        check_announced(self._path, self._taken, self._there, FileFormatError, times=8)
+        return func(*args, **kwargs)
 
 
 def known_classes(classes: Iterable[type] = ()) -> dict[str, Any]:

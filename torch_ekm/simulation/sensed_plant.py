@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..description import HandDescription, ObjectDescription
-from ..exceptions import ObjectLostError, ParameterError
+from ..exceptions import ObjectLostError, StateError
 from ..plant import Observation, Plant, PlantStatus, PlantWrapper, Truth
 from ..sensing.hall.calibration import HallCalibration
 from ..sensing.joint_estimator import JointEstimator
@@ -100,7 +100,7 @@ class SensedPlant(PlantWrapper):
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with what camera and Hall sensors make of its truth in place of the readings."""
         if self._view is None:
-            raise ParameterError("SensedPlant", "not started", "reset with reset(seed) first")
+            raise StateError("there is no grasp yet: call reset(seed) first")
         truth = _truth_of(seen)
         shown = truth.state if truth.pictured is None else truth.pictured
         scene = self._view.scene(shown.q, shown.position, shown.rotation)
@@ -152,5 +152,5 @@ class SensedPlant(PlantWrapper):
 
 def _truth_of(seen: Observation) -> Truth:
     if seen.truth is None:
-        raise ParameterError("Observation.truth", None, "that of a simulation: there is nothing to draw")
+        raise StateError("an observation without truth: only a simulated plant has something to draw")
     return seen.truth

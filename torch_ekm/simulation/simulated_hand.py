@@ -12,7 +12,7 @@ import torch
 
 from .._checks import check_count, check_kind
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
-from ..exceptions import EquilibriumError, GraspError, ParameterError, UnknownNameError
+from ..exceptions import EquilibriumError, GraspError, ParameterError, StateError, UnknownNameError
 from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..typing import Array, Float, Tensor
@@ -255,18 +255,14 @@ class SimulatedHand:
         :meth:`reset`.
 
         Raises:
-            ParameterError: an unknown name, a wrong figure, or ``object_scale`` while there is a grasp;
-                nothing is changed.
+            ParameterError: an unknown name, or a wrong figure; nothing is changed.
+            StateError: ``object_scale`` while there is a grasp, or native tendons; nothing is changed.
         """
         new = self.parameters.replace(**changes)
         if self._rig is not None and new.object_scale != self.parameters.object_scale:
-            raise ParameterError(
-                "object_scale",
-                new.object_scale,
-                f"{self.parameters.object_scale:g} while it is held; close(), change it, then reset(seed)",
-            )
+            raise StateError("the object is held, and cannot grow: close(), change object_scale, reset(seed)")
         if self._native and changes_transmission(self.parameters, new):
-            raise ParameterError("tendon", "native", '"computed", for tendons that change in mid-run')
+            raise StateError('native tendons do not change in mid-run; make the hand with tendon="computed"')
         self._adopt(new)
 
     def tug(self, force: Array, torque: Array, duration: float = 0.05) -> Observation:

@@ -1,33 +1,31 @@
-"""A table of numbers from a CSV or Parquet file; whatever is wrong is named with its line and column."""
+"""A table of numbers from a file; whatever is wrong is named with its line and column."""
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Callable, Sequence
-from functools import partial
+import re
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from ... import interop
-from ..._extras import require
 from ...exceptions import DescriptionError, ParameterError, UnknownNameError
-from ...typing import Array
+from .csv_file import Names, Read, open_csv
+from .parquet_file import open_parquet
 
-Names = tuple[str, ...]
 _BAGS = (".mcap", ".db3", ".bag")
-#: Values ``(n_rows, n)`` of the n columns that it is given.
-Read = Callable[[Sequence[str]], Array]
+_READERS = {
+    ".csv": open_csv, ".tsv": open_csv, ".txt": open_csv, ".parquet": open_parquet, ".pq": open_parquet
+}  # fmt: skip
+_MOST_COLUMNS = 4096
+_INDEXED = re.compile(r"(.+)\[([0-9]{1,4})\]")
 
 
 def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[Names, Read]:
     """Column names, and a function that reads some of the columns, rows in the order of time.
 
-    CSV (``.csv``, ``.tsv``, ``.txt``): UTF-8, separated by comma, semicolon or tab; the first line names the
-    columns, every other field is a number with a decimal point. Parquet (``.parquet``): every column is
-    numeric. Nothing may be missing: a learner cannot guess what a hole means. Columns that are not read may
-    hold anything; a first one without a name, which pandas writes as its index, is skipped. In the column
-    ``label`` each text counts as a number of its own.
+    CSV (``.csv``, ``.tsv``, ``.txt``), see :func:`open_csv`, or Parquet (``.parquet``), see
+    :func:`open_parquet`, of at most 4096 columns. Nothing may be missing: a learner cannot guess what a hole
+    means. Columns that are not read may hold anything; a first one without a name, which pandas writes as
+    its index, is skipped. In the column ``label`` each text counts as a number of its own.
 
     A recording of ROS (MCAP, sqlite3, .bag, the folder of rosbag2) has a row for each message of the topic
     ``clock``.
@@ -38,33 +36,35 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
         ParameterError: a recording of ROS without ``clock``.
         UnknownNameError: the recording has no such topic; the message lists them.
     """
-    readers = {".csv": _csv, ".tsv": _csv, ".txt": _csv, ".parquet": _parquet, ".pq": _parquet}
     kind = path.suffix.lower()
-    if kind not in readers and (path.is_dir() or kind in _BAGS):
+    if kind not in _READERS and (path.is_dir() or kind in _BAGS):
         if clock is None:
             raise ParameterError(
                 "clock", clock, "a topic whose messages set the rows, such as that of the commands"
             )
         heard, _, values = interop.read_bag(path, clock)
         return heard, lambda wanted: values[:, [heard.index(name) for name in wanted]]
-    if not path.is_file():
-        raise DescriptionError(path, "there is no such file")
-    if kind not in readers:
+    if kind not in _READERS:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
-    names, read = readers[kind](path, label)
+    names, read = _READERS[kind](path, label)
+    if len(names) > _MOST_COLUMNS:
+        raise DescriptionError(path, f"{len(names)} columns; at most {_MOST_COLUMNS} are read")
     names = names[1:] if names[:1] == ("",) else names
+    known: set[str] = set()
     for i, name in enumerate(names):
         if not name:
             raise DescriptionError(path, f"column {i + 1} has no name in the header")
-        if name in names[:i]:
+        if name in known:
             raise DescriptionError(path, f"two columns are called '{name}'")
+        known.add(name)
     return names, read
 
 
 def find_columns(wanted: str | Sequence[str], names: Sequence[str]) -> list[str]:
     """Names of the columns, in the order in which they are asked for; ``begin*``: all that begin so.
 
-    A single name stands for a list of one.
+    A single name stands for a list of one. Where the fields of a message have names, ``/topic.field[k]`` is
+    the k-th of ``/topic.field.NAME``.
 
     Raises:
         UnknownNameError: there is no such column; the message lists the columns.
@@ -73,103 +73,10 @@ def find_columns(wanted: str | Sequence[str], names: Sequence[str]) -> list[str]
     for pattern in [wanted] if isinstance(wanted, str) else wanted:
         begin = pattern.removesuffix("*")
         fits = [name for name in names if name == pattern or (begin != pattern and name.startswith(begin))]
+        if not fits and (place := _INDEXED.fullmatch(pattern)):
+            named = [name for name in names if name.startswith(f"{place[1]}.")]
+            fits = named[int(place[2]) :][:1]
         if not fits:
             raise UnknownNameError("column", pattern, names)
-        found += [name for name in fits if name not in found]
-    return found
-
-
-def _csv(path: Path, label: str) -> tuple[Names, Read]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DescriptionError(path, f"byte {error.start} is not UTF-8; save it as CSV in UTF-8") from None
-    lines = text.splitlines()
-    first = next((line for line in lines if line.strip()), None)
-    if first is None:
-        raise DescriptionError(path, "the file is empty")
-    reader = csv.reader(lines, delimiter=max(",;\t", key=first.count))
-    rows = [(reader.line_num, [field.strip() for field in row]) for row in reader if row]
-    number, names = rows[0]
-    if all(_number(field) is not None for field in names):
-        problem = "holds numbers only; the first line must name the columns"
-        raise DescriptionError(path, f"line {number} {problem}")
-    for line, row in rows:
-        if len(row) != len(names):
-            problem = f"has {len(row)} fields, but the header names {len(names)} columns"
-            raise DescriptionError(path, f"line {line} {problem}")
-    if label in names:
-        place = names.index(label)
-        numbers = _numbers([row[place] for _, row in rows[1:]])
-        for (_, row), number in zip(rows[1:], numbers, strict=True):
-            row[place] = number
-    return tuple(names), partial(_csv_values, path, names, rows[1:])
-
-
-def _csv_values(
-    path: Path, names: list[str], rows: list[tuple[int, list[str]]], columns: Sequence[str]
-) -> Array:
-    places = [names.index(name) for name in columns]
-    values = np.array([[_number(row[place]) for place in places] for _, row in rows], dtype=np.float64)
-    values = values.reshape(len(rows), len(places))  # np.float64 makes a NaN of None
-    bad = ~np.isfinite(values)
-    if bad.any():
-        i, j = np.argwhere(bad)[0]
-        line, row = rows[i]
-        field = row[places[j]]
-        problem = f": '{field}' is not finite; fill it in, or leave the whole line out"
-        if _number(field) is None:
-            problem = f": '{field}' is no number; encode it, or leave the column or the line out"
-        if _number(field.replace(",", ".", 1)) is not None and "," in field:
-            problem = f": '{field}' has a decimal comma; write a point"
-        if not field:
-            problem = " is empty; fill it in, or leave the whole line out"
-        n = int(bad.any(1).sum())
-        more = f". {n} of {len(rows)} lines have a field that is no finite number" if n > 1 else ""
-        raise DescriptionError(path, f"line {line}, column '{columns[j]}'{problem}{more}")
-    return values
-
-
-def _numbers(texts: Sequence[str | None]) -> list[str]:
-    """As they are if all are figures; else each text gets a number, and what is empty stays empty."""
-    known = [text or "" for text in texts]
-    if all(_number(text) is not None for text in known if text):
-        return known
-    number_of = {text: str(number) for number, text in enumerate(dict.fromkeys(filter(None, known)))}
-    return [number_of.get(text, "") for text in known]
-
-
-def _number(field: str) -> float | None:
-    try:
-        return float(field)
-    except ValueError:
-        return None
-
-
-def _parquet(path: Path, label: str) -> tuple[Names, Read]:
-    parquet, pyarrow = require("pyarrow.parquet"), require("pyarrow")
-    try:
-        table = parquet.read_table(path)
-    except pyarrow.ArrowInvalid as error:
-        raise DescriptionError(path, f"this is no Parquet file ({error})") from None
-
-    def values(name: str) -> Array:
-        column = table.column(name)
-        kind = column.type
-        if name == label and (pyarrow.types.is_string(kind) or pyarrow.types.is_large_string(kind)):
-            numbers = _numbers(column.to_pylist())
-            column = pyarrow.chunked_array([[float(number) if number else None for number in numbers]])
-            kind = column.type
-        if not (pyarrow.types.is_integer(kind) or pyarrow.types.is_floating(kind)):
-            problem = f"holds {kind}, not numbers; leave it out or encode it"
-            raise DescriptionError(path, f"column '{name}' {problem}")
-        found = column.to_numpy().astype(np.float64)
-        if column.null_count or not np.isfinite(found).all():
-            row = int(np.flatnonzero(~np.isfinite(found))[0])
-            raise DescriptionError(path, f"row {row + 1}, column '{name}' is empty or not finite")
-        return found
-
-    def read(columns: Sequence[str]) -> Array:
-        return np.stack([values(name) for name in columns], -1) if columns else np.empty((len(table), 0))
-
-    return tuple(table.column_names), read
+        found += fits
+    return list(dict.fromkeys(found))

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..._extras import require
-from ...exceptions import GraspError, ParameterError
+from ...exceptions import GraspError, StateError
 from ...typing import Array
 from ..kinematic_model import KinematicModel
 from .motions import Recording, rests
@@ -51,15 +51,15 @@ def calibrate(
 
     Raises:
         UnknownNameError: no such kind of parameter, joint or actuator.
-        ParameterError: no motion can be used.
+        StateError: no motion can be used.
     """
     unknowns = Unknowns(model.hand, parameters)
     evidence = Evidence(model, rests(recordings), unknowns)
     nominal = np.zeros(len(unknowns))
     start = np.maximum(nominal, unknowns.bounds[0] + _INSIDE)  # no derivative leads off a bound
     if not any(one and other for usable in evidence.usable for one, other in pairwise(usable)):
-        reason = "motions between two successive states in which the object is held and its forces are found"
-        raise ParameterError("recordings", "no usable motion", reason)
+        needed = "motions between two successive states in which the object is held and its forces are found"
+        raise StateError(f"no motion of the recordings can be used; needed are {needed}")
     before = evidence(nominal, jacobian=False)
     problem, x = _Problem(evidence, before), start
     for _ in range(_ROUNDS):

@@ -1,0 +1,170 @@
+"""Columns of a CSV file, whoever wrote it: Excel, pandas, numpy, a logger in C."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import math
+import re
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from ..._files import read_file
+from ..._text import decode, figure
+from ...exceptions import DescriptionError
+from ...typing import Array
+
+Names = tuple[str, ...]
+#: Values ``(n_rows, n)`` of the n columns that it is given.
+Read = Callable[[Sequence[str]], Array]
+Records = Callable[[], Iterator[tuple[int, list[str]]]]
+
+_LARGEST = 128 << 20  # bytes: a figure of one digit takes four times as much in memory
+_LONGEST = 1 << 20  # characters of one record, which is a line where no quoted text has line breaks
+_SEPARATORS = ",;\t"
+_EXCEL = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
+_TRIED = 6  # records that tell which separator it is
+
+
+def open_csv(path: Path, label: str) -> tuple[Names, Read]:
+    """Column names, and a function that reads some of them.
+
+    UTF-8, of at most 128 MiB. Separated by comma, semicolon or tab: by the one that gives the first lines as
+    many fields as the header, texts in quotes apart; or as a first line ``sep=;`` says. Lines before the
+    header may be comments, ``# ...``. The header names the columns. Every other field that is read is a
+    number with a decimal point. Blanks around fields, empty lines, and a separator at the end of a line do
+    not count.
+
+    Raises:
+        DescriptionError: the file cannot be used; the message names line and column. The function raises
+            it, too.
+    """
+    content = read_file(path, "CSV file", _LARGEST)
+    decode(content, path)
+    before, given = _preamble(content)
+    tried = [partial(_records, path, content, before, one) for one in given or _SEPARATORS]
+    records = max(tried, key=_fit)
+    number, names = next(records(), (0, []))
+    if not names:
+        raise DescriptionError(path, "the file is empty")
+    names = _trimmed(names, len(names) - 1)
+    if all(figure(field) is not None for field in names):
+        problem = "holds numbers only; the first line must name the columns"
+        raise DescriptionError(path, f"line {number} {problem}")
+    return tuple(names), partial(_read, path, tuple(names), records, label)
+
+
+def _fit(records: Records) -> tuple[bool, int]:
+    """How well a separator does: whether the first lines have as many fields as the header, and how many."""
+    first: list[list[str]] = []
+    try:
+        for _, row in itertools.islice(records(), _TRIED):
+            first.append(row)
+    except DescriptionError:
+        first.append([])
+    names = _trimmed(first[0], len(first[0]) - 1) if first else []
+    same = all(len(_trimmed(row, len(names))) == len(names) for row in first)
+    return same and len(names) > 1, len(names)
+
+
+def _preamble(content: bytes) -> tuple[int, str]:
+    """Lines before the header, and the separator that they say."""
+    separator, length = "", 0
+    for number, line in enumerate(_text(content)):
+        length += len(line)
+        if length > _LONGEST:
+            break
+        line = line.strip("\r\n")
+        told = _EXCEL.fullmatch(line)
+        if told is None and line.strip() and not line.startswith("#"):
+            return number, separator
+        separator = told[1] if told else separator
+    return 0, separator
+
+
+def _text(content: bytes) -> io.TextIOWrapper:
+    """A file of lines with their ends, as csv wants them."""
+    return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")
+
+
+def _records(path: Path, content: bytes, before: int, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """Records that are not blank, with the number of their last line."""
+    length = 0
+
+    def lines() -> Iterator[str]:
+        nonlocal length
+        for line in itertools.islice(_text(content), before, None):
+            length += len(line)
+            if length > _LONGEST:
+                problem = f"ends {_LONGEST} characters without a figure, or in a quote that does not close"
+                raise DescriptionError(path, f"line {before + reader.line_num + 1} {problem}")
+            yield line
+
+    reader = csv.reader(lines(), delimiter=separator, skipinitialspace=True)
+    try:
+        for row in reader:
+            if len(row) > 1 or (row and row[0].strip()):
+                length = 0
+                yield before + reader.line_num, [field.strip() for field in row]
+    except csv.Error as error:
+        raise DescriptionError(path, f"line {before + reader.line_num}: {error}") from None
+
+
+def _trimmed(row: list[str], n: int) -> list[str]:
+    """Without what an n + 1st separator at the end of a line makes."""
+    return row[:n] if n > 0 and len(row) == n + 1 and not row[-1] else row
+
+
+def _read(path: Path, names: Names, records: Records, label: str, columns: Sequence[str]) -> Array:
+    rows = partial(_rows, path, len(names), records)
+    places = [names.index(name) for name in columns]
+    numbers: list[Callable[[str], float | None]] = [figure] * len(columns)
+    if label in columns:
+        at = columns.index(label)
+        numbers[at] = labels(row[places[at]] for _, row in rows())
+    taken, n, bad, first = array("d"), 0, 0, ""
+    for line, row in rows():
+        values = [number(row[place]) for number, place in zip(numbers, places, strict=True)]
+        wrong = [j for j, value in enumerate(values) if value is None or not math.isfinite(value)]
+        if wrong:
+            bad += 1
+            first = first or f"line {line}, column '{columns[wrong[0]]}'{_problem(row[places[wrong[0]]])}"
+        else:
+            taken.extend(values)  # pyright: ignore[reportArgumentType]
+        n += 1
+    if bad:
+        more = f". {bad} of {n} lines have a field that is no finite number" if bad > 1 else ""
+        raise DescriptionError(path, first + more)
+    return np.array(taken).reshape(n, len(places))
+
+
+def _rows(path: Path, n: int, records: Records) -> Iterator[tuple[int, list[str]]]:
+    for line, row in itertools.islice(records(), 1, None):
+        row = _trimmed(row, n)
+        if len(row) != n:
+            problem = f"has {len(row)} fields, but the header names {n} columns"
+            raise DescriptionError(path, f"line {line} {problem}")
+        yield line, row
+
+
+def labels(texts: Iterable[str | None]) -> Callable[[str], float | None]:
+    """The number of a text: that which it is, if all are numbers; else each has one of its own."""
+    found = list(dict.fromkeys(filter(None, texts)))
+    if all(figure(text) is not None for text in found):
+        return figure
+    return {text: float(number) for number, text in enumerate(found)}.get
+
+
+def _problem(field: str) -> str:
+    if not field:
+        return " is empty; fill it in, or leave the whole line out"
+    if "," in field and figure(field.replace(",", ".", 1)) is not None:
+        return f": '{field}' has a decimal comma; write a point"
+    if figure(field) is None:
+        return f": '{field}' is no number; encode it, or leave the column or the line out"
+    return f": '{field}' is not finite; fill it in, or leave the whole line out"

@@ -1,0 +1,107 @@
+"""What a closed loop believes of a hand, since when, against the description."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import NamedTuple
+
+from ..control import HandKnowledge
+from ..control.knowledge import Part, previous
+from ..description import load_hand
+from ..enhanced.hand_figures import HandFigures
+from ..exceptions import EKMError
+from ..kinematics import ServoModel
+
+NOT_IDENTIFIED = "not identified"
+_DEG = math.pi / 180
+
+
+class Belief(NamedTuple):
+    """One figure of a hand."""
+
+    part: Part
+    name: str
+    """Of the actuator, the pad, or the figure."""
+    figure: str
+    """What it is, and its unit."""
+    value: float
+    std: float | None
+    """Standard error of the value; None: it has none."""
+    described: float | None
+    """What holds where nothing is learned; None: nothing does."""
+    note: str
+
+    @property
+    def deviates(self) -> bool:
+        """By more than two standard errors from what is described, or something is to be said of it."""
+        if self.described is None or self.std is None or self.note:
+            return self.note != NOT_IDENTIFIED
+        return abs(self.value - self.described) > 2 * self.std
+
+
+def about(knowledge: HandKnowledge, file: Path, hand: str = "") -> dict[str, str | int]:
+    """Since when it is known, and whether it is of the hand as that is described now.
+
+    Args:
+        file: it was loaded from.
+        hand: its name; else the one that it was learned of.
+    """
+    named = hand or getattr(knowledge.figures, "hand", "")
+    try:
+        knowledge.check(load_hand(named))
+        against = f"that of '{named}'"
+    except EKMError as error:
+        against = str(error) if named else "the file names no hand: --hand"
+    told: dict[str, str | int] = {"written": _date(file), "motions": int(knowledge.figures.count)}
+    if previous(file).is_file():
+        told["before it"] = f"{previous(file)}, {_date(previous(file))}"
+    return {**told, "description": against}
+
+
+def _date(file: Path) -> str:
+    return datetime.fromtimestamp(file.stat().st_mtime).isoformat(" ", "minutes")
+
+
+def beliefs(knowledge: HandKnowledge) -> list[Belief]:
+    """All figures of a :class:`~torch_ekm.control.HandKnowledge`, part by part."""
+    return [*_servo(knowledge), *_forces(knowledge), *_figures(knowledge), *_pace(knowledge)]
+
+
+def _servo(knowledge: HandKnowledge) -> Iterator[Belief]:
+    servo = knowledge.servo
+    if not isinstance(servo, ServoModel):
+        return
+    for figure, values, stds in zip(
+        ("dead zone [deg]", "bias [deg]"), (servo.dead_zone, servo.bias), servo.standard_errors, strict=True
+    ):
+        for i, name in enumerate(servo.names):
+            note = "stuck" * bool(servo.stuck[i])
+            yield Belief("servo", name, figure, float(values[i]) / _DEG, float(stds[i]) / _DEG, 0.0, note)
+
+
+def _forces(knowledge: HandKnowledge) -> Iterator[Belief]:
+    forces = knowledge.forces
+    for i, (scale, std) in enumerate(zip(forces.scale.tolist(), forces.scale_std.tolist(), strict=True)):
+        yield Belief("forces", f"pad {i}", "of the model's answer", scale, std, 1.0, "")
+
+
+def _figures(knowledge: HandKnowledge) -> Iterator[Belief]:
+    learned = knowledge.figures
+    if not isinstance(learned, HandFigures):
+        return
+    changed = {one.name: f"changed after {one.motion} motions" for one in learned.changes}
+    for one in learned.figures:
+        unit, figure = (_DEG, "width [deg]") if one.is_width else (1.0, "of its description")
+        note = changed.get(one.name, "" if one.identified else NOT_IDENTIFIED)
+        yield Belief(
+            "figures", one.name, figure, one.factor / unit, one.std / unit, one.described / unit, note
+        )
+
+
+def _pace(knowledge: HandKnowledge) -> Iterator[Belief]:
+    pace = float(knowledge.pace)
+    note = "" if pace else "not known: the last turn did not reach its target"
+    yield Belief("pace", "last turn", "of the largest step", pace, None, None, note)
