@@ -85,6 +85,8 @@ class HandDriver(ABC):
         self._joints = self._by_lines if joints is None else joints
         self._after = -math.inf  # a reading must be newer: of the last motion's end
         self._last: BusReading | None = None  # that was observed
+        self.notes: list[str] = []
+        """What was found when the bus was opened, and a person should know."""
 
     # -- what a bus does ----------------------------------------------------------------------------
 
@@ -255,7 +257,9 @@ class HandDriver(ABC):
                 if arrived.all() or not self._cut_short():
                     return
             start = self._stands()
-        problem = f"the watchdog has stopped a motion {_TRIES} times: this process is too slow for it"
+        problem = (
+            f"a motion was cut short {_TRIES} times: this process is too slow for the watchdog, or noise"
+        )
         raise BusError(self.wiring.path.name, problem)
 
     def _wait(self, end: float) -> None:
