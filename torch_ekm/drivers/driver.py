@@ -41,6 +41,8 @@ class BusReading:
     fingertips_taken: float = math.inf
     load: Sequence[float] = ()
     """Current or torque of each motor, for ``Observation.info`` [unit of the bus]."""
+    oldest: str = ""
+    """Which motor's reading is the oldest, where they come one by one: for errors."""
 
 
 class HandDriver(ABC):
@@ -132,7 +134,8 @@ class HandDriver(ABC):
             BusError: a device does not answer.
             StaleReadingError: a sensor sends nothing new.
         """
-        return self._observation(self._fresh(self._read()))
+        self._last = self._newer()
+        return self._observation(self._last)
 
     def _observation(self, reading: BusReading) -> Observation:
         now, a = time.monotonic(), self._a(reading)
@@ -187,7 +190,8 @@ class HandDriver(ABC):
             self._move(start, goal)
         else:
             self.hold()
-        return self._observation(self._fresh(self._last or self._read()))
+        self._last = self._newer(reading=self._last)
+        return self._observation(self._last)
 
     def hold(self) -> None:
         """Command the motors to stay where they are: at the median of three readings, one may be wrong.
@@ -197,9 +201,9 @@ class HandDriver(ABC):
             StaleReadingError: the motors send nothing new.
         """
         if not self.dry_run:
-            readings = [self._read()]
+            readings = [self._newer(all_sensors=False)]
             while len(readings) < 3:
-                readings.append(self._another(readings[-1]))
+                readings.append(self._newer(readings[-1].taken, all_sensors=False))
             self._write(np.median([one.motors for one in readings], axis=0).tolist(), _REACH)
 
     def close(self) -> None:
@@ -221,7 +225,7 @@ class HandDriver(ABC):
         # what was seen before the last motion confirms nothing: an old message would agree with it
         last, self._last = self._last or self._read(), None
         for _ in range(_TRIES):
-            reading = self._another(last)
+            reading = self._newer(last.taken)
             a = self._a(reading).numpy()
             if np.abs(a - self._a(last).numpy()).max() <= self.limits.still:
                 return a
@@ -231,14 +235,27 @@ class HandDriver(ABC):
         )
         raise BusError(self.wiring.path.name, problem)
 
-    def _another(self, than: BusReading) -> BusReading:
-        """A reading that was taken later: what is published need not be new at each look."""
+    def _newer(
+        self, than: float = -math.inf, reading: BusReading | None = None, all_sensors: bool = True
+    ) -> BusReading:
+        """A reading whose motors were taken later than that, and whose sensors are all newer than the last
+        motion, and no older than two periods."""
         began = time.monotonic()
-        while (reading := self._read()).taken <= than.taken:
+        while True:
+            reading = reading or self._read()
+            taken = {"motors": reading.taken}
+            if all_sensors:
+                taken |= {"joints": reading.joints_taken, "fingertips": reading.fingertips_taken}
+            # two periods before this call, not before now: a reading does not grow stale by being waited for
+            since = max(began - 2 * self.limits.period, self._after)
+            late = {k: at for k, at in taken.items() if at < since or (k == "motors" and at <= than)}
+            if not late:
+                return reading
             if time.monotonic() - began > max(1.0, 4 * self.limits.period):
-                raise self._stale("motors", reading.taken)
+                name, at = min(late.items(), key=lambda one: one[1])
+                raise self._stale(name, at, reading.oldest if name == "motors" else "")
             time.sleep(_POLL)
-        return reading
+            reading = None
 
     def _move(self, start: Array, goal: Array) -> None:
         """Send a motion piece by piece, and wait for its end."""
@@ -257,9 +274,8 @@ class HandDriver(ABC):
                 if arrived.all() or not self._cut_short():
                     return
             start = self._stands()
-        problem = (
-            f"a motion was cut short {_TRIES} times: this process is too slow for the watchdog, or noise"
-        )
+        remedy = "this process is too slow for it, or goals get lost"
+        problem = f"the watchdog has stopped a motion {_TRIES} times: {remedy}"
         raise BusError(self.wiring.path.name, problem)
 
     def _wait(self, end: float) -> None:
@@ -299,31 +315,11 @@ class HandDriver(ABC):
         way = np.ptp([a for _, a in seen] or [np.zeros(self.hand.n_a)], axis=0)
         return (~(way <= self.limits.still)).tolist()
 
-    def _fresh(self, reading: BusReading) -> BusReading:
-        """A reading whose sensors are all newer than the last motion, and no older than two periods."""
-        began = time.monotonic()
-        while True:
-            old = {
-                "motors": reading.taken,
-                "joints": reading.joints_taken,
-                "fingertips": reading.fingertips_taken,
-            }
-            # two periods before this call, not before now: a reading does not grow stale by being waited for
-            late = {k: at for k, at in old.items() if at < max(began - 2 * self.limits.period, self._after)}
-            if not late:
-                self._last = reading
-                return reading
-            if time.monotonic() - began > max(1.0, 4 * self.limits.period):
-                name, at = min(late.items(), key=lambda one: one[1])
-                raise self._stale(name, at)
-            time.sleep(_POLL)
-            reading = self._read()
-
-    def _stale(self, name: str, at: float) -> StaleReadingError:
+    def _stale(self, name: str, at: float, oldest: str) -> StaleReadingError:
         return StaleReadingError(
-            f"{name} of {self.wiring.path.name}",
+            f"{name}{f' ({oldest})' if oldest else ''} of {self.wiring.path.name}",
             f"the newest reading is {time.monotonic() - at:.3g} s old, [limits] period allows "
-            f"{2 * self.limits.period:.3g} s: check the sensor's cable or node",
+            f"{2 * self.limits.period:.3g} s: check the sensor's cable, node or clock",
         )
 
     def _within(self, start: Array, goal: Array) -> Array:

@@ -6,17 +6,19 @@ import re
 import socket
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..description import HandDescription
 from ..exceptions import BusError
 from .driver import BusReading, HandDriver
+from .one_master import OneMaster
 from .wiring import Wiring
 
 _BUS = ("name_server", "part", "analog", "skin", "speed_deg")
 _TIMEOUT = 1.0  # [s]
+_AGAIN = 0.2  # [s] after it broke, a stream is opened again
 _LONGEST = 1 << 16  # characters of a message
 _REGISTRATION = re.compile(r"registration name (\S+) ip (\S+) port (\d+) type (\S+)")
 _END = "*** end of message"
@@ -52,12 +54,14 @@ class YarpPlant(HandDriver):
         self._server, self.part = (server, int(port)), bus.text("part")
         self._axes = [int(one.id) for one in self.wiring.motors]
         self._streams: dict[str, _Stream] = {}
-        self._rpc = _Connection(self.part + "/rpc:i", *self._find(self.part + "/rpc:i"))
+        self._master: OneMaster | None = None
+        self._rpc = _Connection(self.part + "/rpc:i", self._find)
         try:
+            if not self.dry_run:
+                self._master = OneMaster(f"{self.part} of {server}:{port}")
             for kind, key in (("joints", "analog"), ("fingertips", "skin")):
                 if getattr(self.wiring, kind):
-                    name = bus.text(key)
-                    self._streams[kind] = _Stream(_Connection(name, *self._find(name)))
+                    self._streams[kind] = _Stream(_Connection(bus.text(key), self._find))
             if not self.dry_run:
                 speed = bus.number("speed_deg", math.degrees(self.limits.rate), positive=True)
                 for axis in self._axes:
@@ -98,6 +102,8 @@ class YarpPlant(HandDriver):
     def _release(self) -> None:
         for one in (self._rpc, *self._streams.values()):
             one.close()
+        if self._master is not None:
+            self._master.release()
 
     def _get(self, what: str) -> list[float]:
         """``[is] encs (1.0 2.0 ...) ... [ok]``."""
@@ -119,7 +125,7 @@ class YarpPlant(HandDriver):
 
     def _find(self, name: str) -> tuple[str, int]:
         """Where a port is, by the name server."""
-        server = _Connection("name server", *self._server)
+        server = _Connection("name server", lambda _: self._server)
         try:
             found = _REGISTRATION.search(server.ask(f"query {name}", all_lines=True))
         finally:
@@ -130,21 +136,23 @@ class YarpPlant(HandDriver):
 
 
 class _Connection:
-    """A socket to a YARP port by the text carrier. After a failure it connects again: an answer that comes
-    late must not be taken for the next one.
+    """A socket to a YARP port by the text carrier. After a failure it connects again, where the port is then:
+    an answer that comes late must not be taken for the next one.
 
     Args:
         name: of the port.
-        host, port: where it is.
+        find: says where it is.
     """
 
-    def __init__(self, name: str, host: str, port: int) -> None:
-        self.name, self._where, self._socket = name, (host, port), None
+    def __init__(self, name: str, find: Callable[[str], tuple[str, int]]) -> None:
+        self.name, self._find, self._where, self._socket = name, find, ("?", 0), None
         self._lock, self._data = threading.Lock(), b""
         self.send("")
 
     def send(self, text: str) -> None:
         """Connect, if it is not connected, and send."""
+        if self._socket is None:
+            self._where = self._find(self.name)
         with self._told():
             if self._socket is None:
                 self._data, self._socket = b"", socket.create_connection(self._where, _TIMEOUT)
@@ -198,35 +206,40 @@ class _Connection:
 
 
 class _Stream:
-    """The newest message of a port that sends."""
+    """The newest message of a port that sends; one that broke is opened again."""
 
     def __init__(self, connection: _Connection) -> None:
         self.name, self._connection = connection.name, connection
         self._newest: tuple[list[float], float] | None = None
         self._failure: BusError | None = None
-        self._came = threading.Event()
+        self._came, self._closed = threading.Event(), threading.Event()
         connection.send("r\r\n")
         threading.Thread(target=self._listen, daemon=True).start()
 
     def newest(self) -> tuple[list[float], float]:
         """Its numbers, and when they came [s]; of the first message it waits for a second."""
         self._came.wait(_TIMEOUT)
-        if self._failure is not None:
-            raise BusError(self._failure.device, self._failure.problem)
+        if (failure := self._failure) is not None:
+            raise BusError(failure.device, failure.problem)
         if self._newest is None:
             raise BusError(f"YARP port {self.name}", "it sends nothing")
         return self._newest
 
     def close(self) -> None:
         """Listen no more."""
+        self._closed.set()
         self._connection.close()
 
     def _listen(self) -> None:
-        while self._failure is None:
+        while not self._closed.is_set():
             try:
+                if self._failure is not None:
+                    self._connection.send("r\r\n")
                 words = self._connection.line().strip("()").split()
                 if words and all(_NUMBER.fullmatch(word) for word in words):  # else it is cut or garbled
-                    self._newest = [float(word) for word in words], time.monotonic()
+                    self._newest, self._failure = ([float(word) for word in words], time.monotonic()), None
             except BusError as error:
                 self._failure = error
+                self._closed.wait(_AGAIN)
             self._came.set()
+        self._connection.close()
