@@ -29,10 +29,10 @@ class YarpPlant(HandDriver):
     """A hand behind YARP, such as the iCub's: text over sockets, nothing of YARP is needed here.
 
     Motors are axes of ``part`` in degrees, through its rpc port: ``[get] [encs]``, ``[get] [dons]``,
-    ``[set] [pos]`` with position control and a reference speed; axes that the file does not name are left
-    alone. Joint sensors are numbers of the stream ``analog`` (15 Hall counts of an iCub's hand), fingertips
-    are taxels of the stream ``skin``. Nothing is sent to a hand that stands, and a motion goes out in pieces:
-    if this process dies, the hand stands.
+    ``[set] [pos]`` with position control and a reference speed; an axis that has left position control is an
+    error, and axes that the file does not name are left alone. Joint sensors are numbers of the stream
+    ``analog`` (15 Hall counts of an iCub's hand), fingertips are taxels of the stream ``skin``. Nothing is
+    sent to a hand that stands, and a motion goes out in pieces: if this process dies, the hand stands.
 
     Args:
         wiring: the TOML file; ``[bus]``: ``name_server`` ("host:port"), ``part`` ("/icub/right_arm"),
@@ -99,6 +99,20 @@ class YarpPlant(HandDriver):
         for axis, degrees in zip(self._axes, goal, strict=True):
             self._set(f"[pos] {axis} {degrees:.9g}")
 
+    @contextlib.contextmanager
+    def _moving(self) -> Iterator[None]:
+        self._cut_short()
+        yield
+
+    def _cut_short(self) -> bool:
+        """An axis that has left position control is an error; it would not move, or has stopped."""
+        modes = self._ask("[icmd] [cmds]", "cmds", optional=True)
+        for one, axis in zip(self.wiring.motors, self._axes, strict=True):
+            if len(modes) > axis and (mode := modes[axis].strip("[]")) != "pos":
+                problem = f"its control mode is {mode}, not pos: a fault, a stop button or another program"
+                raise BusError(f"motor '{one.name}', axis {axis} of {self.part}", problem)
+        return False
+
     def _release(self) -> None:
         for one in (self._rpc, *self._streams.values()):
             one.close()
@@ -106,16 +120,22 @@ class YarpPlant(HandDriver):
             self._master.release()
 
     def _get(self, what: str) -> list[float]:
-        """``[is] encs (1.0 2.0 ...) ... [ok]``."""
-        answer = self._rpc.ask(f"[get] [{what}]")
+        words = self._ask(f"[{what}]", what)
+        if not words or not all(_NUMBER.fullmatch(one) for one in words):
+            self._rpc.close()  # answers may be out of step
+            raise BusError(self._rpc.name, f"answers '{' '.join(words)[:80]}' to [get] [{what}]: no numbers")
+        return [float(one) for one in words]
+
+    def _ask(self, command: str, what: str, optional: bool = False) -> list[str]:
+        """``[is] encs (1.0 2.0 ...) ... [ok]``; what is optional may be unknown to the board."""
+        answer = self._rpc.ask(f"[get] {command}")
         found = re.search(rf"\[?is\]? \[?{what}\]? \(([^()]*)\)", answer)
         if found is None or not re.search(r"\[?ok\]?\s*$", answer):
-            self._rpc.close()  # answers may be out of step
-            raise BusError(self._rpc.name, f"answers '{answer[:80]}' to [get] [{what}]")
-        numbers = found[1].split()
-        if not all(_NUMBER.fullmatch(one) for one in numbers):
-            raise BusError(self._rpc.name, f"answers '{answer[:80]}' to [get] [{what}]: no numbers")
-        return [float(one) for one in numbers]
+            if optional:
+                return []
+            self._rpc.close()
+            raise BusError(self._rpc.name, f"answers '{answer[:80]}' to [get] {command}")
+        return found[1].split()
 
     def _set(self, what: str) -> None:
         answer = self._rpc.ask(f"[set] {what}")
