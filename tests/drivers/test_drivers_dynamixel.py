@@ -288,7 +288,7 @@ def test_in_mode_3_a_range_beyond_the_servos_limits_is_refused(tmp_path) -> None
     mode = "baud =|mode = 3\nbaud ="
     with servos() as bus:
         bus.set(1, "max_position", 2000)
-        words = r"toml:16: .*219 to 3173 ticks.* 0 and 2000: write range_deg = \[-68.6, 87.89\], or mode = 4"
+        words = r"toml:15: .*219 to 3173 ticks.* 0 and 2000: write range_deg = \[-68.6, 87.89\], or mode = 4"
         with pytest.raises(DescriptionError, match=words):
             open_at(bus, tmp_path, mode=mode)
         with open_at(bus, tmp_path, mode=mode, a="id = 1|id = 1\nrange_deg = [-68, 87]") as plant:
@@ -306,7 +306,8 @@ def test_turns_that_a_power_cycle_has_taken_are_given_back(turns, tmp_path) -> N
             torch.testing.assert_close(seen.a, TICK * radians(600.0, 600.0))
             after = plant.command(radians(0.05, 0.0))
             torch.testing.assert_close(after.a[0] - seen.a[0], radians(0.05)[0], atol=TICK, rtol=0)
-        assert any("'left': XM430-W210, firmware 46" in x and f"{-4096 * turns:+d}" in x for x in plant.notes)
+        assert plant.notes[0].startswith("motor 'left': XM430-W210, firmware 46")
+        assert f"'zero' is now {1000 + 4096 * turns}: a power cycle" in plant.notes[0]
         bus.reboot(1)
         assert open_at(bus, tmp_path).reset(seed=0).a.tolist() == pytest.approx(after.a.tolist(), abs=1e-3)
 

@@ -10,10 +10,12 @@ from .dynamixel import DynamixelPlant
 from .opening import open_driver
 from .pose import MarkerPose, Sighting, WithPose
 from .ros2 import Ros2Plant, RosPose
+from .servos import SERVOS, Servo
 from .wiring import Channel, Limits, Wiring
 from .yarp import YarpPlant
 
 __all__ = [
+    "SERVOS",
     "BusReading",
     "Channel",
     "DynamixelPlant",
@@ -22,6 +24,7 @@ __all__ = [
     "MarkerPose",
     "Ros2Plant",
     "RosPose",
+    "Servo",
     "Sighting",
     "WithPose",
     "Wiring",

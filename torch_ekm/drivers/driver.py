@@ -73,6 +73,9 @@ class HandDriver(ABC):
         BusError: a device does not answer.
     """
 
+    unit = "units of the bus"
+    """Of the motors' positions."""
+
     def __init__(
         self,
         wiring: Wiring,
@@ -184,8 +187,11 @@ class HandDriver(ABC):
         start = self._stands()
         goal = self._within(start, start + delta.numpy())
         if self.dry_run:
-            shown = zip(self.wiring.motors, self._bus(goal), strict=True)
-            self._say("dry run: " + ", ".join(f"{one.name} (id {one.id}) to {bus:.6g}" for one, bus in shown))
+            shown = [
+                f"{one.name} (id {one.id}) to {one.bus(a):.6g} {self.unit} = {math.degrees(a):.4g} deg"
+                for one, a in zip(self.wiring.motors, goal.tolist(), strict=True)
+            ]
+            self._say(f"dry run: {', '.join(shown)}")
         elif np.any(goal != start):
             self._move(start, goal)
         else:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from ..exceptions import BusError
 from .driver import BusReading, HandDriver
 from .dynamixel_port import DynamixelPort
 from .servos import SERVOS, Servo
-from .wiring import Channel, Wiring
+from .wiring import Wiring
 
 _TURN = 4096
 _TICKS = _TURN / (2 * math.pi)  # per rad
@@ -42,7 +43,7 @@ class DynamixelPlant(HandDriver):
     """A hand on Dynamixel servos, X series or MX(2.0), protocol 2: Yale OpenHand, LEAP, most student hands.
 
     One tick is 2 pi/4096 rad; models, their units and modes are those of
-    :data:`~torch_ekm.drivers.servos.SERVOS`. Registers are read when the driver opens, compared with the
+    :data:`~torch_ekm.drivers.SERVOS`. Registers are read when the driver opens, compared with the
     wiring, and read again before each motion: a servo that has rebooted, has no torque, or whose mode or
     limits were changed is an error. Whole turns that a power cycle has taken are given back where a motor's
     range is less than one. During a motion the servos' own Bus Watchdog is set to 80 ms: they stop if this
@@ -60,6 +61,8 @@ class DynamixelPlant(HandDriver):
         DescriptionError: the file is wrong, or asks for what a servo has not; the message names the line.
         BusError: no such port, another driver has it, a servo does not answer or is of an unknown model.
     """
+
+    unit = "ticks"
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(Wiring.read(wiring, "dynamixel", _TICKS, _BUS, hand=hand), **options)
@@ -84,11 +87,13 @@ class DynamixelPlant(HandDriver):
                 max(1, round(self.limits.rate * one.per_unit / _TICKS / _VELOCITY)) for one in motors
             ]
             mode, current_ma = self._allowed()
-            self._shift, self._sent = [0] * len(motors), [0] * len(motors)
+            self._sent: list[int] = []
             self._seen: list[tuple[int, float, float]] = []  # Realtime Ticks, and between which times
             if not self.dry_run:
                 self._prepare(mode, current_ma)
-            self._shift = self._lost_turns(self._read().motors)
+            self._give_turns_back(self._read().motors)
+            if mode == 3:
+                self._within_limits()
             if not self.dry_run:
                 self._write(self._read().motors, 1.0)
                 for servo in self._ids:
@@ -114,7 +119,7 @@ class DynamixelPlant(HandDriver):
         number = self._found[self._ids.index(servo)]["Model Number"]
         if number not in SERVOS:
             known = ", ".join(sorted(one.name for one in SERVOS.values()))
-            remedy = "if it has their control table, add it to torch_ekm.drivers.servos.SERVOS"
+            remedy = "if it has their control table, add it to torch_ekm.drivers.SERVOS"
             raise BusError(what, f"its model number {number} is none of {known}: {remedy}")
         return SERVOS[number]
 
@@ -139,20 +144,18 @@ class DynamixelPlant(HandDriver):
                 most = math.degrees(found["Velocity Limit"] * _VELOCITY * _TICKS / one.per_unit)
                 problem = f"[limits] rate is above its Velocity Limit: write rate_deg = {math.floor(most)}"
                 raise self.wiring.error("motors", one, problem)
-            if mode == 3:
-                self._within_limits(one, found["Min Position Limit"], found["Max Position Limit"])
         return mode, current_ma
 
-    def _within_limits(self, one: Channel, low: int, high: int) -> None:
+    def _within_limits(self) -> None:
         """In mode 3 a servo takes no goal beyond its limits, and says nothing."""
-        least, most = sorted(round(one.bus(x)) for x in (one.lower, one.upper))
-        if low <= least and most <= high:
-            return
-        allowed = sorted(math.degrees(min(max(one.value(x), one.lower), one.upper)) for x in (low, high))
-        key = "range_deg" if self.wiring.line("motors", one.name, "range_deg") != one.line else "range"
-        problem = f"'{key}' is {least} to {most} ticks, its Position Limits are {low} and {high}"
-        remedy = f"write range_deg = [{allowed[0]:.4g}, {allowed[1]:.4g}], or mode = 4"
-        raise self.wiring.error("motors", one, f"{problem}: {remedy}", key)
+        for one, found in zip(self.wiring.motors, self._found, strict=True):
+            low, high = found["Min Position Limit"], found["Max Position Limit"]
+            least, most = sorted(round(one.bus(x)) for x in (one.lower, one.upper))
+            if least < low or most > high:
+                ends = [math.degrees(min(max(one.value(x), one.lower), one.upper)) for x in (low, high)]
+                problem = f"its range is {least} to {most} ticks, its Position Limits are {low} and {high}"
+                remedy = f"write range_deg = [{min(ends):.4g}, {max(ends):.4g}], or mode = 4"
+                raise self.wiring.error("motors", one, f"{problem}: {remedy}", "range_deg")
 
     def _prepare(self, mode: int, current_ma: float) -> None:
         """Mode and current; a servo that is in its mode keeps its torque, and what it holds."""
@@ -166,22 +169,25 @@ class DynamixelPlant(HandDriver):
                 most = max(1, min(round(current_ma / model.unit_ma), found["Current Limit"]))
                 self._port.write(servo, _CURRENT, most, bus.where("current_ma"))
 
-    def _lost_turns(self, ticks: Sequence[float]) -> list[int]:
-        """Whole turns that power cycles have taken [ticks]: known where a motor's range is less than one."""
-        lost = []
+    def _give_turns_back(self, ticks: Sequence[float]) -> None:
+        """Zeros as if no power cycle had taken whole turns: known where a motor's range is less than one."""
+        motors = []
         for one, model, found, at in zip(self.wiring.motors, self._models, self._found, ticks, strict=True):
             turn, middle = _TURN / one.per_unit, (one.lower + one.upper) / 2  # [rad]
             turns = round((middle - one.value(at)) / turn) if one.upper - one.lower < turn else 0
-            lost.append(one.sign * turns * _TURN)
+            moved = replace(one, zero=one.zero - one.sign * turns * _TURN)
+            motors.append(moved)
             said = [f"{model.name}, firmware {found['Firmware Version']}, it reads {at:.0f} ticks"]
             if turns:
-                said.append(f"a power cycle has taken whole turns: {lost[-1]:+d} ticks are added")
+                said.append(
+                    f"'zero' is now {moved.zero:.6g}: a power cycle has taken whole turns, if it was right"
+                )
             if offset := found["Homing Offset"]:
                 said.append(f"'zero' holds with its Homing Offset of {offset}")
             if found["Drive Mode"] & _REVERSE:
                 said.append("reverse Drive Mode: 'sign' holds with it")
             self.notes.append(f"motor '{one.name}': {'; '.join(said)}")
-        return lost
+        self.wiring = replace(self.wiring, motors=tuple(motors))
 
     # -- what HandDriver asks for -------------------------------------------------------------------
 
@@ -195,9 +201,8 @@ class DynamixelPlant(HandDriver):
             name = self.wiring.motors[jumped[0]].name
             problem = "its clock (Realtime Tick) has jumped: it has rebooted; is its supply too weak?"
             raise BusError(f"motor '{name}'", problem)
-        at = [int.from_bytes(one[12:16], "little", signed=True) for one in found]
         return BusReading(
-            motors=[x + shift for x, shift in zip(at, self._shift, strict=True)],
+            motors=[int.from_bytes(one[12:16], "little", signed=True) for one in found],
             taken=began,
             moving=any(one[2] for one in found),
             load=[int.from_bytes(one[6:8], "little", signed=True) for one in found],
@@ -215,7 +220,7 @@ class DynamixelPlant(HandDriver):
         return jumped
 
     def _write(self, goal: Sequence[float], seconds: float) -> None:
-        self._sent = [round(ticks) - shift for ticks, shift in zip(goal, self._shift, strict=True)]
+        self._sent = [round(ticks) for ticks in goal]
         timed = [found["Drive Mode"] & _TIMED for found in self._found]
         profiles = [
             max(1, round(1e3 * seconds)) if by_time else speed

@@ -52,6 +52,8 @@ class Ros2Plant(HandDriver):
         BusError: nothing is received, nobody listens to commands, or another node commands this hand.
     """
 
+    unit = "rad"
+
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(Wiring.read(wiring, "ros2", 1.0, _BUS, named=True, hand=hand), **options)
         bus, rclpy = self.wiring.bus, require("rclpy")

@@ -45,6 +45,8 @@ class YarpPlant(HandDriver):
         BusError: no name server, no such port, or a part that refuses a command.
     """
 
+    unit = "deg by YARP"
+
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(Wiring.read(wiring, "yarp", 180 / math.pi, _BUS, hand=hand), **options)
         bus = self.wiring.bus
