@@ -288,7 +288,7 @@ def test_in_mode_3_a_range_beyond_the_servos_limits_is_refused(tmp_path) -> None
     mode = "baud =|mode = 3\nbaud ="
     with servos() as bus:
         bus.set(1, "max_position", 2000)
-        words = r"toml:15: .*219 to 3173 ticks.* 0 and 2000: write range_deg = \[-68.6, 87.89\], or mode = 4"
+        words = r"toml:16: .*219 to 3173 ticks.* 0 and 2000: write range_deg = \[-68.6, 87.89\], or mode = 4"
         with pytest.raises(DescriptionError, match=words):
             open_at(bus, tmp_path, mode=mode)
         with open_at(bus, tmp_path, mode=mode, a="id = 1|id = 1\nrange_deg = [-68, 87]") as plant:
