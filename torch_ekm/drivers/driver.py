@@ -120,6 +120,10 @@ class HandDriver(ABC):
         """A watchdog has stopped the motion; it is begun again."""
         return False
 
+    def _while_standing(self) -> None:
+        """Once in each motion, while the motors are waited for: time for further questions to the bus."""
+        return
+
     @abstractmethod
     def _release(self) -> None:
         """Give the port or connection back; the motors hold."""
@@ -293,7 +297,7 @@ class HandDriver(ABC):
 
     def _rest(self, end: float) -> Array:
         """Read until the motors have stood for ``still_for``; they arrive by ``end``. Where they stand."""
-        began, since, seen = time.monotonic(), math.inf, []
+        began, since, seen, asked = time.monotonic(), math.inf, [], False
         while (now := time.monotonic()) - end <= self.limits.timeout:
             reading = self._read()
             if reading.taken > (seen[-1][0] if seen else began):
@@ -304,6 +308,9 @@ class HandDriver(ABC):
             if seen and seen[-1][0] - since >= self.limits.still_for and not any(self._spread(seen)):
                 self._after, self._last = seen[0][0], reading
                 return seen[-1][1]
+            if not asked and math.isfinite(since):
+                asked = True
+                self._while_standing()
             left = since + self.limits.still_for - time.monotonic()
             time.sleep(left if 0 < left < 3 * _LOOK else _POLL if math.isinf(left) else _LOOK)
         with contextlib.suppress(Exception):

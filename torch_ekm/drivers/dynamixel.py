@@ -44,7 +44,7 @@ class DynamixelPlant(HandDriver):
 
     One tick is 2 pi/4096 rad; models, their units and modes are those of
     :data:`~torch_ekm.drivers.SERVOS`. Registers are read when the driver opens, compared with the
-    wiring, and read again before each motion: a servo that has rebooted, has no torque, or whose mode or
+    wiring, and read again with each motion: a servo that has rebooted, has no torque, or whose mode or
     limits were changed is an error. Whole turns that a power cycle has taken are given back where a motor's
     range is less than one. During a motion the servos' own Bus Watchdog is set to 80 ms: they stop if this
     process dies. ``info["load"]`` is the current in the model's unit, or the load in 0.1 %.
@@ -88,6 +88,9 @@ class DynamixelPlant(HandDriver):
             ]
             mode, current_ma = self._allowed()
             self._sent: list[int] = []
+            self._spoilt: tuple[str, str] | None = (
+                None  # servo and problem that nothing but opening again cures
+            )
             self._seen: list[tuple[int, float, float]] = []  # Realtime Ticks, and between which times
             if not self.dry_run:
                 self._prepare(mode, current_ma)
@@ -234,7 +237,8 @@ class DynamixelPlant(HandDriver):
 
     @contextlib.contextmanager
     def _moving(self) -> Iterator[None]:
-        self._registers_hold()
+        torque, _, _ = self._port.sync_read(self._ids, *_TORQUE)
+        self._compare([{"Torque Enable": one[0]} for one in torque])
         self._all(_WATCHDOG[0], bytes(1))  # one that has run out takes no goal
         self._all(_WATCHDOG[0], bytes([_WATCHDOG_MS // 20]))
         try:
@@ -243,9 +247,13 @@ class DynamixelPlant(HandDriver):
             with contextlib.suppress(BusError):
                 self._all(_WATCHDOG[0], bytes(1))
 
+    def _while_standing(self) -> None:
+        self._compare(self._registers())
+
     def _cut_short(self) -> bool:
         """A watchdog has run out, since this process was asleep, or a goal was not taken."""
-        found = self._registers_hold()
+        found = self._registers()
+        self._compare(found)
         goals = [one["Goal Position"] for one in found]
         return goals != self._sent or any(one["Bus Watchdog"] == _OUT for one in found)
 
@@ -267,14 +275,20 @@ class DynamixelPlant(HandDriver):
             for data in self._port.sync_read(self._ids, *_ALL)[0]
         ]
 
-    def _registers_hold(self) -> list[Registers]:
-        """They are as when the driver has opened: no servo has rebooted, and nobody else has changed them."""
-        now = self._registers()
+    def _compare(self, now: list[Registers]) -> None:
+        """With what was found at opening: no servo has rebooted, and nobody else has changed it."""
+        if self._changed(now) and not self._spoilt:
+            self._spoilt = self._changed(self._registers())  # once more: it may have been an old packet
+        if self._spoilt:
+            raise BusError(*self._spoilt)
+
+    def _changed(self, now: list[Registers]) -> tuple[str, str] | None:
+        """Servo and problem."""
         for one, old, new in zip(self.wiring.motors, self._found, now, strict=True):
             other = [name for name in new if new[name] != old[name] and name not in _MAY_CHANGE]
             if other:
                 said = ", ".join(f"{name} {new[name]}, was {old[name]}" for name in other)
                 off = "torque is off" if "Torque Enable" in other else "its settings have changed"
                 remedy = "it has rebooted, or another program was here; open the driver again"
-                raise BusError(f"motor '{one.name}', id {one.id}", f"{off} ({said}): {remedy}")
-        return now
+                return f"motor '{one.name}', id {one.id}", f"{off} ({said}): {remedy}"
+        return None
