@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from .driver import BusReading, HandDriver
 from .dynamixel import DynamixelPlant
+from .emulated import EmulatedPlant
 from .opening import open_driver
 from .pose import MarkerPose, Sighting, WithPose
 from .ros2 import Ros2Plant, RosPose
@@ -19,6 +20,7 @@ __all__ = [
     "BusReading",
     "Channel",
     "DynamixelPlant",
+    "EmulatedPlant",
     "HandDriver",
     "Limits",
     "MarkerPose",

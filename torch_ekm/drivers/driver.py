@@ -6,11 +6,13 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from .._checks import check_finite, check_shape
+from ..description import HandDescription
 from ..exceptions import BusError, CommandRefusedError, NeverAtRestError, StaleReadingError
 from ..plant import Observation, PlantStatus, Stamps
 from ..typing import Array, Float, Tensor
@@ -75,6 +77,15 @@ class HandDriver(ABC):
 
     unit = "units of the bus"
     """Of the motors' positions."""
+
+    @classmethod
+    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
+        """A wiring file for this driver.
+
+        Raises:
+            DescriptionError: the file is wrong; the message names the line.
+        """
+        raise NotImplementedError(f"{cls.__name__} reads no wiring file by itself")
 
     def __init__(
         self,

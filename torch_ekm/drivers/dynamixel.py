@@ -29,14 +29,26 @@ _REGISTERS = {
     "Homing Offset": (20, 4), "Current Limit": (38, 2), "Velocity Limit": (44, 4),
     "Max Position Limit": (48, 4), "Min Position Limit": (52, 4), "Torque Enable": _TORQUE,
     "Bus Watchdog": _WATCHDOG, "Goal Current": _CURRENT, "Goal Position": (116, 4),
+    "Present Position": (132, 4),
 }  # fmt: skip
-_ALL = (0, 120)
-_MAY_CHANGE = ("Bus Watchdog", "Goal Position")
+_ALL = (0, 136)
+_MAY_CHANGE = ("Bus Watchdog", "Goal Position", "Present Position")
 _REVERSE, _TIMED = 1, 4  # bits of Drive Mode
 _OUT = 255  # a watchdog that has run out
 _UPTIME_MS, _SLOW, _JITTER_MS = 32768, 0.03, 60  # that Realtime Tick counts; how wrong it may go
 
 Registers = dict[str, int]
+
+
+def registers(port: DynamixelPort, servos: Sequence[int]) -> list[Registers]:
+    """Of each servo, by their names in the maker's table."""
+    return [
+        {
+            name: int.from_bytes(data[at : at + size], "little", signed=size == 4)
+            for name, (at, size) in _REGISTERS.items()
+        }
+        for data in port.sync_read(servos, *_ALL)[0]
+    ]
 
 
 class DynamixelPlant(HandDriver):
@@ -64,8 +76,13 @@ class DynamixelPlant(HandDriver):
 
     unit = "ticks"
 
+    @classmethod
+    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
+        """A wiring file for this driver."""
+        return Wiring.read(path, "dynamixel", _TICKS, _BUS, hand=hand)
+
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
-        super().__init__(Wiring.read(wiring, "dynamixel", _TICKS, _BUS, hand=hand), **options)
+        super().__init__(self.wired(wiring, hand), **options)
         bus, motors = self.wiring.bus, self.wiring.motors
         self._refuse_what_no_servo_has()
         self._ids: list[int] = [int(one.id) for one in motors]
@@ -266,14 +283,7 @@ class DynamixelPlant(HandDriver):
         self._port.sync_write(self._ids, address, [value] * len(self._ids))
 
     def _registers(self) -> list[Registers]:
-        """Of each servo."""
-        return [
-            {
-                name: int.from_bytes(data[at : at + size], "little", signed=size == 4)
-                for name, (at, size) in _REGISTERS.items()
-            }
-            for data in self._port.sync_read(self._ids, *_ALL)[0]
-        ]
+        return registers(self._port, self._ids)
 
     def _compare(self, now: list[Registers]) -> None:
         """With what was found at opening: no servo has rebooted, and nobody else has changed it."""

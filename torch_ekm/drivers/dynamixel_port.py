@@ -71,6 +71,11 @@ class DynamixelPort:
         with contextlib.suppress(Exception):
             self._handler.closePort()
 
+    def scan(self) -> list[int]:
+        """Ids of the servos that answer."""
+        with self._told():
+            return sorted(self._packets.broadcastPing(self._handler)[0])
+
     def ping(self, servo: int) -> None:
         """Whether a servo is there.
 
@@ -142,7 +147,7 @@ class DynamixelPort:
     def _check(self, result: int, what: str) -> None:
         sdk = self._sdk
         if result == sdk.COMM_RX_TIMEOUT:
-            raise BusError(what, "no answer: check cable and power")
+            raise BusError(what, "no answer: check cable, power, and that its Status Return Level is 2")
         if result == sdk.COMM_RX_CORRUPT:
             raise BusError(what, "a packet with a wrong checksum: noise, or two servos with one id")
         if result != sdk.COMM_SUCCESS:

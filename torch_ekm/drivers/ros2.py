@@ -54,8 +54,13 @@ class Ros2Plant(HandDriver):
 
     unit = "rad"
 
+    @classmethod
+    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
+        """A wiring file for this driver."""
+        return Wiring.read(path, "ros2", 1.0, _BUS, named=True, hand=hand)
+
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
-        super().__init__(Wiring.read(wiring, "ros2", 1.0, _BUS, named=True, hand=hand), **options)
+        super().__init__(self.wired(wiring, hand), **options)
         bus, rclpy = self.wiring.bus, require("rclpy")
         self._kind = bus.text("kind", "trajectory")
         if self._kind not in _KINDS:

@@ -45,10 +45,15 @@ class YarpPlant(HandDriver):
         BusError: no name server, no such port, or a part that refuses a command.
     """
 
-    unit = "deg by YARP"
+    unit = "deg"
+
+    @classmethod
+    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
+        """A wiring file for this driver."""
+        return Wiring.read(path, "yarp", 180 / math.pi, _BUS, hand=hand)
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
-        super().__init__(Wiring.read(wiring, "yarp", 180 / math.pi, _BUS, hand=hand), **options)
+        super().__init__(self.wired(wiring, hand), **options)
         bus = self.wiring.bus
         server, _, port = bus.text("name_server", "localhost:10000").rpartition(":")
         if not port.isdigit() or not server:
