@@ -307,7 +307,7 @@ def test_turns_that_a_power_cycle_has_taken_are_given_back(turns, tmp_path) -> N
             after = plant.command(radians(0.05, 0.0))
             torch.testing.assert_close(after.a[0] - seen.a[0], radians(0.05)[0], atol=TICK, rtol=0)
         assert plant.notes[0].startswith("motor 'left': XM430-W210, firmware 46")
-        assert f"'zero' is now {1000 + 4096 * turns}: a power cycle" in plant.notes[0]
+        assert f"has taken whole turns: 'zero' is now {1000 + 4096 * turns}" in plant.notes[0]
         bus.reboot(1)
         assert open_at(bus, tmp_path).reset(seed=0).a.tolist() == pytest.approx(after.a.tolist(), abs=1e-3)
 

@@ -75,8 +75,10 @@ class HandDriver(ABC):
         BusError: a device does not answer.
     """
 
-    unit = "units of the bus"
-    """Of the motors' positions."""
+    driver, unit, per_rad, named = "", "units of the bus", 1.0, False
+    keys: tuple[str, ...] = ()
+    """What a wiring file for it has: its name, the unit of positions and how many are a rad, whether ids are
+    names, keys of ``[bus]``."""
 
     @classmethod
     def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
@@ -85,7 +87,7 @@ class HandDriver(ABC):
         Raises:
             DescriptionError: the file is wrong; the message names the line.
         """
-        raise NotImplementedError(f"{cls.__name__} reads no wiring file by itself")
+        return Wiring.read(path, cls.driver, cls.per_rad, cls.keys, named=cls.named, hand=hand)
 
     def __init__(
         self,

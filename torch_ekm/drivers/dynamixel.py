@@ -12,13 +12,11 @@ from ..exceptions import BusError
 from .driver import BusReading, HandDriver
 from .dynamixel_port import DynamixelPort
 from .servos import SERVOS, Servo
-from .wiring import Wiring
 
 _TURN = 4096
 _TICKS = _TURN / (2 * math.pi)  # per rad
 _VELOCITY = 0.229 * 2 * math.pi / 60  # [rad/s] of a unit of Profile Velocity
 _WATCHDOG_MS = 80
-_BUS = ("port", "baud", "mode", "current_ma")
 _LAST_ID = 252
 # control table of the X series: (address, bytes)
 _MODE, _TORQUE, _LEVEL, _WATCHDOG, _CURRENT = (11, 1), (64, 1), (68, 1), (98, 1), (102, 2)
@@ -74,12 +72,8 @@ class DynamixelPlant(HandDriver):
         BusError: no such port, another driver has it, a servo does not answer or is of an unknown model.
     """
 
-    unit = "ticks"
-
-    @classmethod
-    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
-        """A wiring file for this driver."""
-        return Wiring.read(path, "dynamixel", _TICKS, _BUS, hand=hand)
+    driver, unit, per_rad = "dynamixel", "ticks", _TICKS
+    keys = ("port", "baud", "mode", "current_ma")
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)
@@ -99,15 +93,14 @@ class DynamixelPlant(HandDriver):
             if not self.dry_run:
                 self._all(_LEVEL[0], bytes([2]))  # else some do not answer
             self._found = self._registers()
-            self._models = [self._model(servo, what[servo]) for servo in self._ids]
+            pairs = zip(self._found, what.values(), strict=True)
+            self._models = [self._model(found["Model Number"], name) for found, name in pairs]
             self._speeds = [
                 max(1, round(self.limits.rate * one.per_unit / _TICKS / _VELOCITY)) for one in motors
             ]
             mode, current_ma = self._allowed()
             self._sent: list[int] = []
-            self._spoilt: tuple[str, str] | None = (
-                None  # servo and problem that nothing but opening again cures
-            )
+            self._changed: tuple[str, str] | None = None  # servo and problem: only opening again cures it
             self._seen: list[tuple[int, float, float]] = []  # Realtime Ticks, and between which times
             if not self.dry_run:
                 self._prepare(mode, current_ma)
@@ -135,8 +128,7 @@ class DynamixelPlant(HandDriver):
                 remedy = "remove it, or read them in a driver of your own"
                 raise wiring.error(kind, found[0], f"servos report no [[{kind}]]: {remedy}")
 
-    def _model(self, servo: int, what: str) -> Servo:
-        number = self._found[self._ids.index(servo)]["Model Number"]
+    def _model(self, number: int, what: str) -> Servo:
         if number not in SERVOS:
             known = ", ".join(sorted(one.name for one in SERVOS.values()))
             remedy = "if it has their control table, add it to torch_ekm.drivers.SERVOS"
@@ -195,13 +187,10 @@ class DynamixelPlant(HandDriver):
         for one, model, found, at in zip(self.wiring.motors, self._models, self._found, ticks, strict=True):
             turn, middle = _TURN / one.per_unit, (one.lower + one.upper) / 2  # [rad]
             turns = round((middle - one.value(at)) / turn) if one.upper - one.lower < turn else 0
-            moved = replace(one, zero=one.zero - one.sign * turns * _TURN)
-            motors.append(moved)
+            motors.append(replace(one, zero=one.zero - one.sign * turns * _TURN))
             said = [f"{model.name}, firmware {found['Firmware Version']}, it reads {at:.0f} ticks"]
             if turns:
-                said.append(
-                    f"'zero' is now {moved.zero:.6g}: a power cycle has taken whole turns, if it was right"
-                )
+                said.append(f"a power cycle has taken whole turns: 'zero' is now {motors[-1].zero:.6g}")
             if offset := found["Homing Offset"]:
                 said.append(f"'zero' holds with its Homing Offset of {offset}")
             if found["Drive Mode"] & _REVERSE:
@@ -241,15 +230,10 @@ class DynamixelPlant(HandDriver):
 
     def _write(self, goal: Sequence[float], seconds: float) -> None:
         self._sent = [round(ticks) for ticks in goal]
-        timed = [found["Drive Mode"] & _TIMED for found in self._found]
-        profiles = [
-            max(1, round(1e3 * seconds)) if by_time else speed
-            for by_time, speed in zip(timed, self._speeds, strict=True)
-        ]
-        packed = [
-            profile.to_bytes(4, "little") + at.to_bytes(4, "little", signed=True)
-            for profile, at in zip(profiles, self._sent, strict=True)
-        ]
+        by_time, packed = max(1, round(1e3 * seconds)), []
+        for found, speed, at in zip(self._found, self._speeds, self._sent, strict=True):
+            profile = by_time if found["Drive Mode"] & _TIMED else speed
+            packed.append(profile.to_bytes(4, "little") + at.to_bytes(4, "little", signed=True))
         self._port.sync_write(self._ids, _GOAL, packed)
 
     @contextlib.contextmanager
@@ -287,16 +271,14 @@ class DynamixelPlant(HandDriver):
 
     def _compare(self, now: list[Registers]) -> None:
         """With what was found at opening: no servo has rebooted, and nobody else has changed it."""
-        if self._changed(now) and not self._spoilt:
-            self._spoilt = self._changed(self._registers())  # once more: it may have been an old packet
-        if self._spoilt:
-            raise BusError(*self._spoilt)
+        if self._change(now) and not self._changed:
+            self._changed = self._change(self._registers())  # once more: it may have been an old packet
+        if self._changed:
+            raise BusError(*self._changed)
 
-    def _changed(self, now: list[Registers]) -> tuple[str, str] | None:
-        """Servo and problem."""
+    def _change(self, now: list[Registers]) -> tuple[str, str] | None:
         for one, old, new in zip(self.wiring.motors, self._found, now, strict=True):
-            other = [name for name in new if new[name] != old[name] and name not in _MAY_CHANGE]
-            if other:
+            if other := [name for name in new if new[name] != old[name] and name not in _MAY_CHANGE]:
                 said = ", ".join(f"{name} {new[name]}, was {old[name]}" for name in other)
                 off = "torque is off" if "Torque Enable" in other else "its settings have changed"
                 remedy = "it has rebooted, or another program was here; open the driver again"

@@ -18,9 +18,7 @@ from .driver import BusReading, HandDriver
 from .gathered import Gathered, SenderClock, Value
 from .one_master import OneMaster
 from .pose import Sighting
-from .wiring import Wiring
 
-_BUS = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time", "node")
 _KINDS = ("trajectory", "array", "joint_state")
 _TIMEOUT = 3.0  # [s] for the first message and the first subscriber
 _DISCOVERED = 0.4  # [s] by then a node that runs is known
@@ -52,12 +50,8 @@ class Ros2Plant(HandDriver):
         BusError: nothing is received, nobody listens to commands, or another node commands this hand.
     """
 
-    unit = "rad"
-
-    @classmethod
-    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
-        """A wiring file for this driver."""
-        return Wiring.read(path, "ros2", 1.0, _BUS, named=True, hand=hand)
+    driver, unit, named = "ros2", "rad", True
+    keys = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time", "node")
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)

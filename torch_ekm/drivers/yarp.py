@@ -14,9 +14,7 @@ from ..description import HandDescription
 from ..exceptions import BusError
 from .driver import BusReading, HandDriver
 from .one_master import OneMaster
-from .wiring import Wiring
 
-_BUS = ("name_server", "part", "analog", "skin", "speed_deg")
 _TIMEOUT = 1.0  # [s]
 _AGAIN = 0.2  # [s] after it broke, a stream is opened again
 _LONGEST = 1 << 16  # characters of a message
@@ -45,12 +43,8 @@ class YarpPlant(HandDriver):
         BusError: no name server, no such port, or a part that refuses a command.
     """
 
-    unit = "deg"
-
-    @classmethod
-    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
-        """A wiring file for this driver."""
-        return Wiring.read(path, "yarp", 180 / math.pi, _BUS, hand=hand)
+    driver, unit, per_rad = "yarp", "deg", 180 / math.pi
+    keys = ("name_server", "part", "analog", "skin", "speed_deg")
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)
