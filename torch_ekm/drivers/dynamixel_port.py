@@ -116,7 +116,7 @@ class DynamixelPort:
             data = list(value.to_bytes(size, "little"))
             result, error = self._packets.writeTxRx(self._handler, servo, address, size, data)
             self._check(result, self._name(servo))
-            self._healthy(servo, error, f", {value} at address {address}: {what}")
+            self._healthy(servo, error, f"it refuses {value} for {what}: ")
 
         self._again(write)
 
@@ -142,7 +142,7 @@ class DynamixelPort:
             raise BusError(self._name(servo), problem)
         if error:
             text = self._packets.getRxPacketError(error).removeprefix("[RxPacketError] ")
-            raise BusError(self._name(servo), f"{text}{of}")
+            raise BusError(self._name(servo), f"{of}{text}")
 
     def _check(self, result: int, what: str) -> None:
         sdk = self._sdk
