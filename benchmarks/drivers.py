@@ -36,7 +36,7 @@ from no_bus import FakeDriver
 
 from torch_ekm.control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, StopReason
 from torch_ekm.description import HandDescription, load_object
-from torch_ekm.drivers import Channel, HandDriver, WithPose, dynamixel, yarp
+from torch_ekm.drivers import Channel, HandDriver, WithPose, dynamixel_port, yarp
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import DeviceError
 from torch_ekm.model import KinematicModel
@@ -111,7 +111,7 @@ def spoilt(bus: Bus, folder: Path, n: int) -> tuple[int, int, int, int]:
     """
     draw, motions, errors, beyond, count = random.Random(1000), 0, 0, 0, 0
     with (
-        patch.object(dynamixel, "_PATIENCE_MS", 50.0),  # what is cut is waited for
+        patch.object(dynamixel_port, "_PATIENCE_MS", 50.0),  # what is cut is waited for
         patch.object(yarp, "_TIMEOUT", 0.05),
         opened(bus, folder, str(SPEED), rate_deg=30.0, timeout=0.5) as (end, path),
         bus.driver(path) as driver,

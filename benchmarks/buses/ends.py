@@ -157,7 +157,7 @@ class Yarp:
     """A genuine name server, and a genuine rpc port; the driver reaches it by a cable that can be spoilt."""
 
     def __init__(self, motors: Any, python: str) -> None:
-        self.motors, self.goals = motors, []
+        self.motors, self.goals, self.modes = motors, [], {}
         self._spoiler, self._silent = Spoiler(0.0, 0), False
         with socket.create_server(("127.0.0.1", 0)) as free:
             self._server = free.getsockname()[1]
@@ -206,7 +206,7 @@ class Yarp:
         assert self._board.stdin is not None
         assert self._board.stdout is not None
         for line in self._board.stdout:
-            told, text = self.motors.goal, answer(line.strip(), self.motors)
+            told, text = self.motors.goal, answer(line.strip(), self.motors, modes=self.modes)
             if self.motors.goal is not told:
                 self.goals.append(list(self.motors.goal))
             self._board.stdin.write(text + "\n")

@@ -196,7 +196,10 @@ def test_a_dry_run_prints_and_sends_nothing(tmp_path) -> None:
     driver = FakeDriver(write(tmp_path), dry_run=True, say=said.append)
     driver.command(radians(0.05, 0.0))
     driver.hold()
-    assert said == ["dry run: left (id 1) to 1630, right (id 2) to 2400"]
+    assert said == [
+        "dry run: left (id 1) to 1630 units of the bus = 60.16 deg, "
+        "right (id 2) to 2400 units of the bus = 57.3 deg"
+    ]
     assert not driver.written
 
 

@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from wirings import T42, write
 
 pytest.importorskip("dynamixel_sdk")
 
-from dynamixel_bus import DynamixelBus
+from dynamixel_bus import REGISTERS, DynamixelBus
 from motors import Motors
 from spoiling import Spoiler
 
@@ -27,6 +28,7 @@ from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
 
 DEG = math.pi / 180
 TICK = 2 * math.pi / 4096
+STUFFED = -0x20001  # FF FF FD FF on the bus
 
 
 @pytest.fixture
@@ -58,16 +60,16 @@ def test_a_motion_over_the_bus(bus, tmp_path) -> None:
         torch.testing.assert_close(after.a, seen.a + radians(5 * DEG, -5 * DEG), atol=TICK / 2, rtol=0)
         plant.observe()  # a sync write has no answer: what comes after it has
         assert left[98] == 0  # at rest no watchdog
-    assert not plant._handler.is_open
+    assert not plant._port.open
 
 
 def test_stuffed_bytes_arrive(bus, tmp_path) -> None:
     with open_at(bus, tmp_path) as plant:
-        plant._sync_write((116, 4), [0x01FDFFFF, 5])
+        plant._write([STUFFED, 5], 0.0)
         plant._read()  # a sync write has no answer: what comes after it has
-        assert bus.goals[-1] == [float(0x01FDFFFF), 5.0]
-        bus.motors = Motors([0x01FDFFFF, 5.0], 1.0)
-        assert plant._read().motors == [0x01FDFFFF, 5]
+        assert bus.goals[-1] == [float(STUFFED), 5.0]
+        bus.motors = Motors([STUFFED, 5.0], 1.0)
+        assert plant._read().motors == [STUFFED, 5]
 
 
 def test_a_servo_that_is_lost_is_named_with_its_line(bus, tmp_path) -> None:
@@ -134,7 +136,9 @@ def test_a_packet_that_is_lost_is_asked_for_again(bus, tmp_path) -> None:
 def test_a_servo_that_has_switched_off_says_why(bus, tmp_path) -> None:
     with open_at(bus, tmp_path) as plant:
         bus.tables[2][70] = 0b100100
-        with pytest.raises(BusError, match="servo 2: overheated, overload: it has switched off"):
+        with pytest.raises(
+            BusError, match=r"motor 'right', id 2 .*:9\): overheated, overload: it has switched off"
+        ):
             plant.observe()
         bus.tables[2][70] = 0
 
@@ -143,7 +147,7 @@ def test_a_servo_that_has_switched_off_says_why(bus, tmp_path) -> None:
     ("change", "line", "words"),
     [
         ("baud =|mode = 1\nbaud =", 7, "'mode' must be 3, 4 or 5 (positions), got 1"),
-        ("baud =|current_ma = 6000\nbaud =", 7, "'current_ma' must be at most 5506, got 6000"),
+        ("baud =|current_ma = 6000\nbaud =", 7, "'current_ma' must be at most 3209.17, got 6000"),
         ("id = 1|id = 253", 17, "[[motors]] 'left': 'id' must be at most 252, got 253"),
         ("[limits]|[[joints]]\nname = 'left_0'\nid = 3\n[limits]", 20, "servos report no [[joints]]"),
     ],
@@ -152,7 +156,7 @@ def test_what_no_servo_has_is_named_before_anything_is_sent(change, line, words,
     with pytest.raises(DescriptionError, match=rf"my_hand.toml:{line}: .*{re.escape(words)}"):
         open_at(bus, tmp_path, change=change)
     assert bus.goals == []
-    assert bus.tables[1][11] == bus.tables[2][11] == 0
+    assert bus.tables[1][11] == bus.tables[2][11] == 3
 
 
 def test_two_servos_with_one_id(bus, tmp_path) -> None:
@@ -225,3 +229,167 @@ def test_the_hand_stands_within_100_ms_after_its_process_is_killed(tmp_path) -> 
         plant = DynamixelPlant(path)  # the next process clears the watchdog
         plant.command(radians(0.05, 0.0))
         plant.close()
+
+
+# -- what servos are -----------------------------------------------------------------------------------------
+
+MODELS = {  # number: current for 350 mA, mode without one in the file
+    1030: (130, 5), 1020: (130, 5), 1000: (130, 5), 1200: (350, 5), 1240: (350, 5), 1060: (None, 4),
+}  # fmt: skip
+
+
+def servos(model: int = 1030, at: float = 1600.0) -> DynamixelBus:
+    return DynamixelBus([1, 2], Motors([at, 2400.0], 4000.0), model)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_six_models_have_their_own_units_and_modes(model, tmp_path) -> None:
+    register, mode = MODELS[model]
+    with servos(model) as bus:
+        if register is None:
+            with pytest.raises(DescriptionError, match=r"toml:7: .*'current_ma' .* mode 4.*XL430-W250"):
+                open_at(bus, tmp_path, current="baud =|current_ma = 350\nbaud =")
+            with pytest.raises(DescriptionError, match=r"toml:7: .*'mode' must be 3 or 4 .*got 5.*XL430"):
+                open_at(bus, tmp_path, mode="baud =|mode = 5\nbaud =")
+        change = "baud =|baud =" if register is None else "baud =|current_ma = 350\nbaud ="
+        with open_at(bus, tmp_path, change=change) as plant:
+            assert bus.get(1, "mode") == mode
+            assert register in (None, bus.get(1, "current"))
+            seen = plant.reset(seed=0)
+            after = plant.command(radians(0.05, -0.02))
+            torch.testing.assert_close(after.a - seen.a, radians(0.05, -0.02), atol=TICK, rtol=0)
+
+
+def test_a_model_that_nobody_knows_is_refused_by_name_and_line(tmp_path) -> None:
+    with (
+        servos(350) as bus,
+        pytest.raises(BusError, match=r"'left'.*toml:15\): its model number 350 is none"),
+    ):
+        open_at(bus, tmp_path)
+    assert bus.goals == []
+
+
+def test_more_than_a_servo_allows_names_the_key_and_its_line(tmp_path) -> None:
+    with servos(1240) as bus:
+        bus.set(2, "current_limit", 300)
+        words = r"toml:7: .*'current_ma' must be at most 300, got 350: motor 'right' is a servo XC330-M288"
+        with pytest.raises(DescriptionError, match=words):
+            open_at(bus, tmp_path, change="baud =|current_ma = 350\nbaud =")
+        bus.set(1, "velocity_limit", 100)
+        with pytest.raises(
+            DescriptionError, match=r"toml:15: .*'left'.*Velocity Limit: write rate_deg = 137"
+        ):
+            open_at(bus, tmp_path)
+        open_at(bus, tmp_path, change="rate_deg = 200|rate_deg = 137").close()
+
+
+def test_in_mode_3_a_range_beyond_the_servos_limits_is_refused(tmp_path) -> None:
+    """It would take no goal there, and say nothing."""
+    mode = "baud =|mode = 3\nbaud ="
+    with servos() as bus:
+        bus.set(1, "max_position", 2000)
+        words = r"toml:16: .*219 to 3173 ticks.* 0 and 2000: write range_deg = \[-68.6, 87.89\], or mode = 4"
+        with pytest.raises(DescriptionError, match=words):
+            open_at(bus, tmp_path, mode=mode)
+        with open_at(bus, tmp_path, mode=mode, a="id = 1|id = 1\nrange_deg = [-68, 87]") as plant:
+            plant.command(radians(0.34, 0.0))
+            after = plant.command(radians(0.34, 0.0))  # to the end of the range
+            torch.testing.assert_close(after.a[0], radians(87 * DEG)[0], atol=TICK, rtol=0)
+        open_at(bus, tmp_path, mode="baud =|mode = 4\nbaud =").close()
+
+
+@pytest.mark.parametrize("turns", [-3, -1, 1])
+def test_turns_that_a_power_cycle_has_taken_are_given_back(turns, tmp_path) -> None:
+    with servos(at=1600.0 + 4096 * turns) as bus:
+        with open_at(bus, tmp_path) as plant:
+            seen = plant.reset(seed=0)
+            torch.testing.assert_close(seen.a, TICK * radians(600.0, 600.0))
+            after = plant.command(radians(0.05, 0.0))
+            torch.testing.assert_close(after.a[0] - seen.a[0], radians(0.05)[0], atol=TICK, rtol=0)
+        assert plant.notes[0].startswith("motor 'left': XM430-W210, firmware 46")
+        assert f"has taken whole turns: 'zero' is now {1000 + 4096 * turns}" in plant.notes[0]
+        bus.reboot(1)
+        assert open_at(bus, tmp_path).reset(seed=0).a.tolist() == pytest.approx(after.a.tolist(), abs=1e-3)
+
+
+def test_drive_mode_and_homing_offset_are_known(tmp_path) -> None:
+    """Servo 1 counts the other way and from elsewhere; servo 2 takes the time of a motion, not a speed."""
+    with servos() as bus:
+        bus.set(1, "drive_mode", 1)
+        bus.set(1, "homing", 5000)
+        bus.set(2, "drive_mode", 4)
+        wired = {"a": "id = 1\nzero = 1000|id = 1\nzero = 4000\nsign = -1"}
+        with open_at(bus, tmp_path, **wired) as plant:
+            assert "reverse Drive Mode" in plant.notes[0]
+            assert "Homing Offset of 5000" in plant.notes[0]
+            seen = plant.reset(seed=0)
+            torch.testing.assert_close(seen.a, TICK * radians(600.0, 600.0))
+            after = plant.command(radians(5 * DEG, -5 * DEG))
+            torch.testing.assert_close(after.a - seen.a, radians(5 * DEG, -5 * DEG), atol=TICK, rtol=0)
+            assert bus.get(1, "profile") == 146  # 0.229 rpm
+            assert 20 <= bus.get(2, "profile") <= 30  # 5 deg at 200 deg/s [ms]
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_servos_that_answer_little_are_told_to_answer(level, tmp_path) -> None:
+    with servos() as bus:
+        for servo in bus.ids:
+            bus.set(servo, "level", level)
+        with open_at(bus, tmp_path) as plant:
+            plant.command(radians(0.05, 0.0))
+
+
+def test_one_hand_has_one_master(bus, tmp_path) -> None:
+    with open_at(bus, tmp_path), pytest.raises(BusError, match="another program or driver has it open"):
+        open_at(bus, tmp_path)
+    open_at(bus, tmp_path).close()
+
+
+CHANGES = {
+    "torque off": (lambda bus: bus.set(2, "torque", 0), r"id 2: torque is off \(Torque Enable 0, was 1"),
+    "reboot": (lambda bus: bus.reboot(2), "'right', id 2: torque is off|'right': its clock .* rebooted"),
+    "mode": (lambda bus: bus.set(1, "mode", 1), r"'left', id 1: its settings .*Operating Mode 1, was 5"),
+    "limit": (lambda bus: bus.set(1, "current_limit", 9), "'left', id 1: its settings .*Current Limit 9"),
+    "current": (lambda bus: bus.set(1, "current", 9), "'left', id 1: its settings .*Goal Current 9"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_servo_that_is_not_what_it_was_ends_the_motion(name, bus, tmp_path) -> None:
+    change, words = CHANGES[name]
+    with open_at(bus, tmp_path) as plant:
+        plant.command(radians(0.05, 0.05))
+        time.sleep(0.2)
+        change(bus)
+        sent = []
+        for _ in range(3):  # it stays an error until the driver is opened again
+            with pytest.raises(BusError, match=words):
+                plant.command(radians(0.05, 0.05))
+            bus.catch_up()
+            sent.append(len(bus.goals))
+        assert sent[2] == sent[1]
+    with open_at(bus, tmp_path) as plant:
+        plant.command(radians(0.05, 0.05))
+
+
+def test_a_servo_that_reboots_in_a_motion_ends_it(tmp_path) -> None:
+    with DynamixelBus([1, 2], Motors([1600.0, 2400.0], 400.0)) as bus, open_at(bus, tmp_path) as plant:
+        time.sleep(0.2)
+        threading.Timer(0.1, bus.reboot, [2]).start()
+        with pytest.raises(BusError, match=r"'right': its clock .* has rebooted|torque is off"):
+            plant.command(radians(0.3, 0.3))
+
+
+REFUSED = [  # before torque, register, value, error of protocol 2
+    (1, "mode", 4, 7), (0, "mode", 7, 4), (0, "mode", 0, 0), (1, "current", 1194, 6), (1, "position", 5, 7),
+    (1, "goal", 1048576, 6), (1, "profile", 32768, 4), (1, "torque", 2, 4), (1, "homing", 1, 7),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("torque", "name", "value", "error"), REFUSED)
+def test_the_emulated_bus_refuses_what_a_servo_refuses(torque, name, value, error) -> None:
+    with servos() as bus:
+        bus.set(1, "mode", 5)
+        bus.set(1, "torque", torque)
+        address, size = REGISTERS[name]
+        assert bus._write(address, {1: value.to_bytes(size, "little")}).get(1, 0) == error

@@ -148,3 +148,44 @@ def test_garbled_messages_send_no_axis_beyond_its_limits(yarp, tmp_path, monkeyp
     assert moved
     yarp.spoil = lambda data: data
     plant.close()
+
+
+def look(plant: YarpPlant) -> None:
+    for _ in range(20):
+        plant.observe()
+        time.sleep(0.01)
+
+
+def test_a_stream_that_broke_is_opened_again(yarp, tmp_path) -> None:
+    with YarpPlant(wiring(tmp_path, yarp.server, HALL, ANALOG)) as plant:
+        plant.observe()
+        yarp.hang_up()
+        with pytest.raises(DeviceError):
+            look(plant)
+        yarp.hall = 100.0
+        time.sleep(0.5)
+        seen = plant.observe()
+        at = ICUB.joint_names.index("index_1")
+        assert float(seen.q[at]) == pytest.approx((255 - 103) / 162.3, abs=0.02)
+
+
+def test_an_axis_that_has_left_position_control_ends_the_motion(yarp, tmp_path) -> None:
+    with YarpPlant(wiring(tmp_path, yarp.server)) as plant:
+        plant.command(increment(thumb_distal=0.02))
+        yarp.modes[10] = "[hwf]"
+        sent = len(yarp.commands)
+        problem = "motor 'thumb_distal', axis 10 of /icub/right_arm: its control mode is hwf"
+        with pytest.raises(BusError, match=problem):
+            plant.command(increment(index_distal=0.02))
+        assert len(yarp.commands) == sent
+    with pytest.raises(BusError, match="refuses"):
+        YarpPlant(wiring(tmp_path, yarp.server))
+    yarp.modes.clear()
+    YarpPlant(wiring(tmp_path, yarp.server)).close()
+
+
+def test_one_hand_has_one_master(yarp, tmp_path) -> None:
+    path = wiring(tmp_path, yarp.server)
+    with YarpPlant(path), pytest.raises(BusError, match=r"/icub/right_arm of .*one hand has one master"):
+        YarpPlant(path)
+    YarpPlant(path).close()

@@ -26,8 +26,10 @@ class GoldenYarp:
         self.commands: list[str] = []
         self.spoil: Callable[[bytes], bytes] = lambda data: data
         self.hall = 128.0
+        self.modes: dict[int, str] = {}
         self.open = True
         self.sockets: list[socket.socket] = []
+        self.listening: list[socket.socket] = []
         self.rpc, self.analog = self._serve(self._ask), self._serve(self._stream)
         self.server = self._serve(self._names)
 
@@ -39,9 +41,17 @@ class GoldenYarp:
                 one.shutdown(socket.SHUT_RDWR)
             one.close()
 
+    def hang_up(self) -> None:
+        """Drop the connections; who calls again is served."""
+        for one in [x for x in self.sockets if x not in self.listening]:
+            self.sockets.remove(one)
+            with contextlib.suppress(OSError):
+                one.shutdown(socket.SHUT_RDWR)
+
     def _serve(self, talk: Callable[[socket.socket], None]) -> int:
         listening = socket.create_server(("127.0.0.1", 0))
         self.sockets.append(listening)
+        self.listening.append(listening)
 
         def accept() -> None:
             while self.open:
@@ -85,7 +95,7 @@ class GoldenYarp:
     def _answer(self, text: str) -> str:
         if not text.startswith("[get]"):
             self.commands.append(text)
-        return answer(text, self.motors, first=7)
+        return answer(text, self.motors, first=7, modes=self.modes)
 
     def _stream(self, one: socket.socket) -> None:
         for text in self._lines(one):

@@ -215,6 +215,6 @@ def test_an_absurd_density_is_told(compared: Comparison) -> None:
 def test_a_stream_survives_its_file(tmp_path: Path) -> None:
     stream = linear()
     names, read = open_table(stream.save(tmp_path / "a.csv"))
-    values = read(names)
+    values = read(names).values
     assert names == ("x1", "x2", "x3", "y1", "y2")
     np.testing.assert_array_equal(values, torch.cat([stream.x, stream.y], 1).numpy())

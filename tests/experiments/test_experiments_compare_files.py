@@ -136,7 +136,7 @@ def test_csv_is_read_as_it_was_written(delimiter: str, tmp_path: Path) -> None:
     np.savetxt(path, values, delimiter=delimiter, header=delimiter.join("abcd"), comments="", fmt="%.17g")
     names, read = open_table(path)
     assert names == ("a", "b", "c", "d")
-    np.testing.assert_array_equal(read("dbca"), values[:, [3, 1, 2, 0]])
+    np.testing.assert_array_equal(read("dbca").values, values[:, [3, 1, 2, 0]])
 
 
 def test_parquet_is_csv(tmp_path: Path) -> None:
@@ -147,7 +147,7 @@ def test_parquet_is_csv(tmp_path: Path) -> None:
     parquet.write_table(pyarrow.table(columns), tmp_path / "good.parquet")
     names, read = open_table(tmp_path / "good.parquet")
     assert names == ("a", "b", "c", "d")
-    np.testing.assert_array_equal(read("dbca"), values[:, [3, 1, 2, 0]])
+    np.testing.assert_array_equal(read("dbca").values, values[:, [3, 1, 2, 0]])
     holes = pyarrow.table({"a": [1.0, None], "y": [1.0, 2.0]})
     parquet.write_table(holes, tmp_path / "holes.parquet")
     with pytest.raises(DescriptionError, match="row 2, column 'a'"):

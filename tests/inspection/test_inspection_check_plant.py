@@ -299,6 +299,7 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
         path.write_text(text)
         done = CliRunner().invoke(app, ["check", "--plant", str(path)])
         assert done.exit_code == 0, done.output
+        assert "XM430-W210, firmware 46" in done.output
         assert "no sensors at the joints of left" in done.output
         assert "2 motors go as commanded; without" in done.output
         assert "and joints with them" not in done.output  # none has a sensor
@@ -310,7 +311,7 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
         assert "does not move" not in done.output
         bus.catch_up()
         assert bus.goals == []
-        path.write_text(text.replace("zero = 1900", "zero = 5000"))
+        path.write_text(text.replace("zero = 1900", "zero = 4242"))
         done = CliRunner().invoke(app, ["check", "--plant", str(path)])
         assert done.exit_code == 1
         assert "my_hand.toml" in done.output

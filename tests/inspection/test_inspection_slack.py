@@ -66,7 +66,7 @@ class Sticky(Motors):
 
 @pytest.fixture
 def bus(monkeypatch):
-    monkeypatch.setattr("torch_ekm.drivers.dynamixel._PATIENCE_MS", 2000.0)  # the machine may be busy
+    monkeypatch.setattr("torch_ekm.drivers.dynamixel_port._PATIENCE_MS", 2000.0)  # the machine may be busy
     with DynamixelBus([1, 2], Motors([1150.0, 2850.0], 40000.0)) as bus:
         noise = random.Random(0)
         bus.currents = lambda ticks: [

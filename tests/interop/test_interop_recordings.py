@@ -132,9 +132,14 @@ def test_other_topics_stand_as_they_were_last_heard(kind: str, tmp_path: Path) -
             writer.write(fast, 10**9 * stamp + 1, pack(number(data=float(stamp)), "std_msgs/msg/Float64"))
     table = read_bag(bag, clock="/command")
     columns = dict(zip(table.names, table.values.T, strict=True))
-    assert columns["/command.data"].tolist() == [2, 3, 4, 5, 6, 7, 8, 9]
-    assert columns["/joints.position.index"].tolist() == [4, 4, 4, 4, 12, 12, 12, 12]
-    assert columns["/joints.position.thumb"].tolist() == [2, 2, 2, 2, 6, 6, 6, 6]
+    assert columns["/command.data"].tolist() == [*range(10)]
+    index, thumb = columns["/joints.position.index"], columns["/joints.position.thumb"]
+    assert np.isnan(index[:2]).all()
+    assert index[2:].tolist() == [4, 4, 4, 4, 12, 12, 12, 12]
+    assert thumb[2:].tolist() == [2, 2, 2, 2, 6, 6, 6, 6]
+    assert table.age[:, table.names.index("/joints.position.thumb")][2:6] == pytest.approx(
+        [0, 1, 2, 3], abs=1e-8
+    )
     with pytest.raises(DescriptionError, match="no such recording"):
         read_bag(tmp_path / "nothing", clock="/command")
     (tmp_path / "broken.mcap").write_bytes(b"not a recording")

@@ -70,6 +70,9 @@ def check(
     dry_run: Annotated[
         bool, Option(help="With --plant: read the bus, print the commands, move nothing.")
     ] = False,
+    emulate: Annotated[
+        bool, Option(help="With --plant: without the hand, which then is wired as the file says.")
+    ] = False,
 ) -> None:
     """Check a hand, from its files to a pinch of an object; or the wiring of a real one.
 
@@ -86,7 +89,7 @@ def check(
         from ..drivers import open_driver
         from ..inspection.check_plant import check_plant
 
-        with open_driver(plant, dry_run=dry_run, say=say) as driver:
+        with open_driver(plant, emulate=emulate, dry_run=dry_run, say=say) as driver:
             rows = check_plant(driver, driver.hand)
     elif not hand:
         raise ParameterError("hand", hand, "a hand or a path to a URDF; or --plant with a wiring file")

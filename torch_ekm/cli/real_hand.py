@@ -43,6 +43,30 @@ def slack(
         say(f"Written:   {plant.resolve()}")
 
 
+@app.command()
+@needs("robot")
+def drivers(
+    hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")],
+    new: Annotated[Path, Option(metavar="TOML", help="The wiring file to write.")],
+    port: Annotated[str, Option(help="Where the Dynamixel servos are.")] = "/dev/ttyUSB0",
+    baud: Annotated[int, Option(help="0: the usual ones are tried.")] = 0,
+) -> None:
+    """Write a wiring file from a scan of a bus: ids, models, limits, and where the motors stand.
+
+    Nothing is written to a servo. Put the hand at rest first: zeros are where the motors stand. Names are
+    given in the order of ids, and signs are 1: guesses, which 'torch-ekm check --plant' tests.
+    """
+    from .._files import write_whole
+    from ..inspection.new_wiring import BAUDS, new_wiring
+
+    if new.exists():
+        raise ParameterError("new", str(new), "a file that does not exist yet")
+    text = new_wiring(port, hand, (baud,) if baud else BAUDS)
+    write_whole(new, text)
+    say(text)
+    say(f"Written:   {new.resolve()}")
+
+
 @app.command(name="identify-servo")
 @needs("robot")
 def identify_servo(plant: Wired, out: Learned = None) -> None:

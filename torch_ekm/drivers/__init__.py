@@ -7,21 +7,26 @@ from __future__ import annotations
 
 from .driver import BusReading, HandDriver
 from .dynamixel import DynamixelPlant
+from .emulated import EmulatedPlant
 from .opening import open_driver
 from .pose import MarkerPose, Sighting, WithPose
 from .ros2 import Ros2Plant, RosPose
+from .servos import SERVOS, Servo
 from .wiring import Channel, Limits, Wiring
 from .yarp import YarpPlant
 
 __all__ = [
+    "SERVOS",
     "BusReading",
     "Channel",
     "DynamixelPlant",
+    "EmulatedPlant",
     "HandDriver",
     "Limits",
     "MarkerPose",
     "Ros2Plant",
     "RosPose",
+    "Servo",
     "Sighting",
     "WithPose",
     "Wiring",

@@ -6,11 +6,13 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from .._checks import check_finite, check_shape
+from ..description import HandDescription
 from ..exceptions import BusError, CommandRefusedError, NeverAtRestError, StaleReadingError
 from ..plant import Observation, PlantStatus, Stamps
 from ..typing import Array, Float, Tensor
@@ -41,6 +43,8 @@ class BusReading:
     fingertips_taken: float = math.inf
     load: Sequence[float] = ()
     """Current or torque of each motor, for ``Observation.info`` [unit of the bus]."""
+    oldest: str = ""
+    """Which motor's reading is the oldest, where they come one by one: for errors."""
 
 
 class HandDriver(ABC):
@@ -71,6 +75,20 @@ class HandDriver(ABC):
         BusError: a device does not answer.
     """
 
+    driver, unit, per_rad, named = "", "units of the bus", 1.0, False
+    keys: tuple[str, ...] = ()
+    """What a wiring file for it has: its name, the unit of positions and how many are a rad, whether ids are
+    names, keys of ``[bus]``."""
+
+    @classmethod
+    def wired(cls, path: str | Path, hand: HandDescription | None = None) -> Wiring:
+        """A wiring file for this driver.
+
+        Raises:
+            DescriptionError: the file is wrong; the message names the line.
+        """
+        return Wiring.read(path, cls.driver, cls.per_rad, cls.keys, named=cls.named, hand=hand)
+
     def __init__(
         self,
         wiring: Wiring,
@@ -85,6 +103,8 @@ class HandDriver(ABC):
         self._joints = self._by_lines if joints is None else joints
         self._after = -math.inf  # a reading must be newer: of the last motion's end
         self._last: BusReading | None = None  # that was observed
+        self.notes: list[str] = []
+        """What was found when the bus was opened, and a person should know."""
 
     # -- what a bus does ----------------------------------------------------------------------------
 
@@ -113,6 +133,10 @@ class HandDriver(ABC):
         """A watchdog has stopped the motion; it is begun again."""
         return False
 
+    def _while_standing(self) -> None:
+        """Once in each motion, while the motors are waited for: time for further questions to the bus."""
+        return
+
     @abstractmethod
     def _release(self) -> None:
         """Give the port or connection back; the motors hold."""
@@ -130,7 +154,8 @@ class HandDriver(ABC):
             BusError: a device does not answer.
             StaleReadingError: a sensor sends nothing new.
         """
-        return self._observation(self._fresh(self._read()))
+        self._last = self._newer()
+        return self._observation(self._last)
 
     def _observation(self, reading: BusReading) -> Observation:
         now, a = time.monotonic(), self._a(reading)
@@ -179,13 +204,17 @@ class HandDriver(ABC):
         start = self._stands()
         goal = self._within(start, start + delta.numpy())
         if self.dry_run:
-            shown = zip(self.wiring.motors, self._bus(goal), strict=True)
-            self._say("dry run: " + ", ".join(f"{one.name} (id {one.id}) to {bus:.6g}" for one, bus in shown))
+            shown = [
+                f"{one.name} (id {one.id}) to {one.bus(a):.6g} {self.unit} = {math.degrees(a):.4g} deg"
+                for one, a in zip(self.wiring.motors, goal.tolist(), strict=True)
+            ]
+            self._say(f"dry run: {', '.join(shown)}")
         elif np.any(goal != start):
             self._move(start, goal)
         else:
             self.hold()
-        return self._observation(self._fresh(self._last or self._read()))
+        self._last = self._newer(reading=self._last)
+        return self._observation(self._last)
 
     def hold(self) -> None:
         """Command the motors to stay where they are: at the median of three readings, one may be wrong.
@@ -195,9 +224,9 @@ class HandDriver(ABC):
             StaleReadingError: the motors send nothing new.
         """
         if not self.dry_run:
-            readings = [self._read()]
+            readings = [self._newer(all_sensors=False)]
             while len(readings) < 3:
-                readings.append(self._another(readings[-1]))
+                readings.append(self._newer(readings[-1].taken, all_sensors=False))
             self._write(np.median([one.motors for one in readings], axis=0).tolist(), _REACH)
 
     def close(self) -> None:
@@ -219,7 +248,7 @@ class HandDriver(ABC):
         # what was seen before the last motion confirms nothing: an old message would agree with it
         last, self._last = self._last or self._read(), None
         for _ in range(_TRIES):
-            reading = self._another(last)
+            reading = self._newer(last.taken)
             a = self._a(reading).numpy()
             if np.abs(a - self._a(last).numpy()).max() <= self.limits.still:
                 return a
@@ -229,14 +258,27 @@ class HandDriver(ABC):
         )
         raise BusError(self.wiring.path.name, problem)
 
-    def _another(self, than: BusReading) -> BusReading:
-        """A reading that was taken later: what is published need not be new at each look."""
+    def _newer(
+        self, than: float = -math.inf, reading: BusReading | None = None, all_sensors: bool = True
+    ) -> BusReading:
+        """A reading whose motors were taken later than that, and whose sensors are all newer than the last
+        motion, and no older than two periods."""
         began = time.monotonic()
-        while (reading := self._read()).taken <= than.taken:
+        while True:
+            reading = reading or self._read()
+            taken = {"motors": reading.taken}
+            if all_sensors:
+                taken |= {"joints": reading.joints_taken, "fingertips": reading.fingertips_taken}
+            # two periods before this call, not before now: a reading does not grow stale by being waited for
+            since = max(began - 2 * self.limits.period, self._after)
+            late = {k: at for k, at in taken.items() if at < since or (k == "motors" and at <= than)}
+            if not late:
+                return reading
             if time.monotonic() - began > max(1.0, 4 * self.limits.period):
-                raise self._stale("motors", reading.taken)
+                name, at = min(late.items(), key=lambda one: one[1])
+                raise self._stale(name, at, reading.oldest if name == "motors" else "")
             time.sleep(_POLL)
-        return reading
+            reading = None
 
     def _move(self, start: Array, goal: Array) -> None:
         """Send a motion piece by piece, and wait for its end."""
@@ -255,7 +297,8 @@ class HandDriver(ABC):
                 if arrived.all() or not self._cut_short():
                     return
             start = self._stands()
-        problem = f"the watchdog has stopped a motion {_TRIES} times: this process is too slow for it"
+        remedy = "this process is too slow for it, or goals get lost"
+        problem = f"the watchdog has stopped a motion {_TRIES} times: {remedy}"
         raise BusError(self.wiring.path.name, problem)
 
     def _wait(self, end: float) -> None:
@@ -267,7 +310,7 @@ class HandDriver(ABC):
 
     def _rest(self, end: float) -> Array:
         """Read until the motors have stood for ``still_for``; they arrive by ``end``. Where they stand."""
-        began, since, seen = time.monotonic(), math.inf, []
+        began, since, seen, asked = time.monotonic(), math.inf, [], False
         while (now := time.monotonic()) - end <= self.limits.timeout:
             reading = self._read()
             if reading.taken > (seen[-1][0] if seen else began):
@@ -278,6 +321,9 @@ class HandDriver(ABC):
             if seen and seen[-1][0] - since >= self.limits.still_for and not any(self._spread(seen)):
                 self._after, self._last = seen[0][0], reading
                 return seen[-1][1]
+            if not asked and math.isfinite(since):
+                asked = True
+                self._while_standing()
             left = since + self.limits.still_for - time.monotonic()
             time.sleep(left if 0 < left < 3 * _LOOK else _POLL if math.isinf(left) else _LOOK)
         with contextlib.suppress(Exception):
@@ -295,31 +341,11 @@ class HandDriver(ABC):
         way = np.ptp([a for _, a in seen] or [np.zeros(self.hand.n_a)], axis=0)
         return (~(way <= self.limits.still)).tolist()
 
-    def _fresh(self, reading: BusReading) -> BusReading:
-        """A reading whose sensors are all newer than the last motion, and no older than two periods."""
-        began = time.monotonic()
-        while True:
-            old = {
-                "motors": reading.taken,
-                "joints": reading.joints_taken,
-                "fingertips": reading.fingertips_taken,
-            }
-            # two periods before this call, not before now: a reading does not grow stale by being waited for
-            late = {k: at for k, at in old.items() if at < max(began - 2 * self.limits.period, self._after)}
-            if not late:
-                self._last = reading
-                return reading
-            if time.monotonic() - began > max(1.0, 4 * self.limits.period):
-                name, at = min(late.items(), key=lambda one: one[1])
-                raise self._stale(name, at)
-            time.sleep(_POLL)
-            reading = self._read()
-
-    def _stale(self, name: str, at: float) -> StaleReadingError:
+    def _stale(self, name: str, at: float, oldest: str) -> StaleReadingError:
         return StaleReadingError(
-            f"{name} of {self.wiring.path.name}",
+            f"{name}{f' ({oldest})' if oldest else ''} of {self.wiring.path.name}",
             f"the newest reading is {time.monotonic() - at:.3g} s old, [limits] period allows "
-            f"{2 * self.limits.period:.3g} s: check the sensor's cable or node",
+            f"{2 * self.limits.period:.3g} s: check the sensor's cable, node or clock",
         )
 
     def _within(self, start: Array, goal: Array) -> Array:

@@ -9,6 +9,7 @@ from ..description import HandDescription
 from ..exceptions import UnknownNameError
 from .driver import HandDriver
 from .dynamixel import DynamixelPlant
+from .emulated import EmulatedPlant
 from .ros2 import Ros2Plant
 from .wiring import driver_of
 from .yarp import YarpPlant
@@ -16,12 +17,15 @@ from .yarp import YarpPlant
 DRIVERS = {"dynamixel": DynamixelPlant, "ros2": Ros2Plant, "yarp": YarpPlant}
 
 
-def open_driver(wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> HandDriver:
+def open_driver(
+    wiring: str | Path, hand: HandDescription | None = None, *, emulate: bool = False, **options: Any
+) -> HandDriver:
     """The driver that ``[hand] driver`` names, connected to its bus.
 
     Args:
         wiring: the TOML file.
         hand: its description; None: the one that the file names.
+        emulate: no bus is opened: an :class:`EmulatedPlant`.
         options: see :class:`HandDriver`.
 
     Raises:
@@ -32,4 +36,7 @@ def open_driver(wiring: str | Path, hand: HandDescription | None = None, **optio
     name = driver_of(wiring)
     if name not in DRIVERS:
         raise UnknownNameError("driver", name, DRIVERS)
-    return DRIVERS[name](wiring, hand, **options)
+    driver = DRIVERS[name]
+    if emulate:
+        return EmulatedPlant(driver.wired(wiring, hand), driver.unit, **options)
+    return driver(wiring, hand, **options)

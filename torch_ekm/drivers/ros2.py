@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,38 +15,46 @@ from .._extras import require
 from ..description import HandDescription
 from ..exceptions import BusError
 from .driver import BusReading, HandDriver
+from .gathered import Gathered, SenderClock, Value
+from .one_master import OneMaster
 from .pose import Sighting
-from .wiring import Wiring
 
-_BUS = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time", "node")
 _KINDS = ("trajectory", "array", "joint_state")
 _TIMEOUT = 3.0  # [s] for the first message and the first subscriber
+_DISCOVERED = 0.4  # [s] by then a node that runs is known
+_ONLY_RELIABLE = " ([bus] reliable = true hears reliable publishers only)"
+_SYNCHRONOUS = 0.02  # [s] of clocks: less is not worth a note
 
 
 class Ros2Plant(HandDriver):
     """A hand behind ROS 2: anything with ros2_control, the nodes of LEAP and Allegro.
 
-    Reads sensor_msgs/JointState by name; commands positions: a trajectory of one point, an array of numbers,
-    or a JointState. Readings are dated by their headers, on the node's clock. A controller that follows one
-    point holds it: if this process dies, the hand stands after the piece under way.
+    Reads sensor_msgs/JointState by name, whoever sends it: a reading is complete when all wired names are new
+    enough. Commands positions: a trajectory of one point, an array of numbers, or a JointState. Readings are
+    dated by their headers; a sender's clock that is off ours is measured from arrivals, and stated in
+    ``notes``. A controller that follows one point holds it: if this process dies, the hand stands after the
+    piece under way.
 
     Args:
         wiring: the TOML file; ids are names in the messages. ``[bus]``: ``joint_states`` ("/joint_states"),
             ``command`` (topic), ``kind`` ("trajectory": trajectory_msgs/JointTrajectory; "array":
             std_msgs/Float64MultiArray, in the description's order; "joint_state"), ``fingertips`` (a
-            std_msgs/Float64MultiArray, ids are places), ``reliable`` (true; false: best effort),
-            ``use_sim_time``, ``node``.
+            std_msgs/Float64MultiArray, ids are places), ``reliable`` (false: hears all publishers; true: only
+            reliable ones, whose lost messages come again), ``use_sim_time``, ``node``.
         hand: its description; None: the one that the file names.
         options: see :class:`HandDriver`.
 
     Raises:
         MissingExtraError: rclpy is not there (a ROS 2 that is sourced, or extra ``ros2``).
         DescriptionError: the file is wrong; the message names the line.
-        BusError: nothing is received, or nobody listens to commands.
+        BusError: nothing is received, nobody listens to commands, or another node commands this hand.
     """
 
+    driver, unit, named = "ros2", "rad", True
+    keys = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time", "node")
+
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
-        super().__init__(Wiring.read(wiring, "ros2", 1.0, _BUS, named=True, hand=hand), **options)
+        super().__init__(self.wired(wiring, hand), **options)
         bus, rclpy = self.wiring.bus, require("rclpy")
         self._kind = bus.text("kind", "trajectory")
         if self._kind not in _KINDS:
@@ -57,6 +66,7 @@ class Ros2Plant(HandDriver):
             "trajectory": require("trajectory_msgs.msg"),
             "std": require("std_msgs.msg"),
         }
+        self._master: OneMaster | None = None
         self._context = rclpy.Context()
         self._context.init(args=[])
         parameters = []
@@ -67,20 +77,17 @@ class Ros2Plant(HandDriver):
         )
         """For further subscriptions, such as :class:`RosPose`."""
         policy = qos.ReliabilityPolicy
-        reliable = bus.flag("reliable", True)
-        quality = qos.QoSProfile(depth=1, reliability=policy.RELIABLE if reliable else policy.BEST_EFFORT)
-        self._newest: dict[str, tuple[Any, float]] = {}
-        self.node.create_subscription(
-            self._messages["sensor"].JointState,
-            self._states_topic,
-            lambda m: self._take("states", m),
-            quality,
+        reliable = bus.flag("reliable", False)
+        self._quality = qos.QoSProfile(  # a depth of 1 would drop what two nodes send at once
+            depth=50, reliability=policy.RELIABLE if reliable else policy.BEST_EFFORT
         )
+        self._ids = [str(one.id) for one in (*self.wiring.motors, *self.wiring.joints)]
+        self._states = Gathered(self._states_topic, self._ids, self._called)
+        self._force: tuple[Sequence[float], float] | None = None
+        self.subscribe(self._messages["sensor"].JointState, self._states_topic, self._take)
         if self.wiring.fingertips:
-            self.node.create_subscription(
-                self._messages["std"].Float64MultiArray, bus.text("fingertips"),
-                lambda m: self._take("fingertips", m), quality,
-            )  # fmt: skip
+            array = self._messages["std"].Float64MultiArray
+            self.subscribe(array, bus.text("fingertips"), self._take_force)
         kind = {"trajectory": self._messages["trajectory"].JointTrajectory,
                 "array": self._messages["std"].Float64MultiArray,
                 "joint_state": self._messages["sensor"].JointState}[self._kind]  # fmt: skip
@@ -90,14 +97,30 @@ class Ros2Plant(HandDriver):
         self._thread = threading.Thread(target=self._spin, daemon=True)
         self._thread.start()
         try:
-            offered = f"is [bus] reliable = {str(reliable).lower()} what it offers?"
-            nothing = f"nothing is received on {self._states_topic}: is its publisher running, and {offered}"
-            self._first("states", nothing)
+            if not self.dry_run:
+                self._master = OneMaster(f"{topic} of domain {os.environ.get('ROS_DOMAIN_ID', 0)}")
+            self._first(
+                lambda: None not in self._newest("position", self._ids),
+                lambda: self._states.absent(self._ids) + (_ONLY_RELIABLE if reliable else ""),
+            )
             end = time.monotonic() + _TIMEOUT
             while not self.dry_run and self._publisher.get_subscription_count() == 0:
                 if time.monotonic() > end:
                     raise BusError(topic, "no node subscribes to it: is the controller running?")
                 time.sleep(0.01)
+            # a node of our own name may be one that was killed: it stays in the graph for some seconds
+            own = f"{self.node.get_namespace().rstrip('/')}/{self.node.get_name()}"
+            others = {name for name, _ in self.publishers(topic)} - {own}
+            if others and not self.dry_run:
+                problem = f"node {', '.join(sorted(others))} commands there, too: one hand has one master"
+                raise BusError(topic, problem)
+            for sender, clock in self._states.clocks.items():
+                if abs(clock.behind) > _SYNCHRONOUS:
+                    way = "behind" if clock.behind > 0 else "ahead of"
+                    off = f"{abs(clock.behind):.3g} s {way} this machine's"
+                    self.notes.append(
+                        f"the clock of {self._called(sender)} is {off}, as measured from arrivals"
+                    )
         except BaseException:
             self._release()
             raise
@@ -106,52 +129,97 @@ class Ros2Plant(HandDriver):
         with contextlib.suppress(Exception):  # the context was shut down
             self._executor.spin()
 
-    def taken(self, stamp: Any) -> float:
-        """A header's stamp, by the node's clock, as a time of ``time.monotonic()`` [s]."""
-        now = self.node.get_clock().now().nanoseconds
-        return time.monotonic() - 1e-9 * (now - stamp.sec * 1_000_000_000 - stamp.nanosec)
+    # -- what arrives -------------------------------------------------------------------------------
 
-    def _take(self, kind: str, message: Any) -> None:
-        dated = kind == "states" and (message.header.stamp.sec or message.header.stamp.nanosec)
-        taken = self.taken(message.header.stamp) if dated else time.monotonic()
-        self._newest[kind] = message, min(taken, time.monotonic())
+    def subscribe(self, kind: Any, topic: str, take: Callable[[Any, Any], None]) -> None:
+        """``take`` gets each message and what the middleware knows of it, in the wiring's quality."""
+        informs = hasattr(require("rclpy.subscription").Subscription, "CallbackType")  # since ROS 2 Iron
+        back = take if informs else lambda message: take(message, {})
+        self.node.create_subscription(kind, topic, back, self._quality)
 
-    def _first(self, kind: str, problem: str) -> tuple[Any, float]:
+    def publishers(self, topic: str) -> list[tuple[str, bytes]]:
+        """Nodes that publish a topic, and by which id; names come a little later than messages."""
+        end = time.monotonic() + _DISCOVERED
+        while True:
+            found = self.node.get_publishers_info_by_topic(topic)
+            if time.monotonic() > end or not any("UNKNOWN" in one.node_name for one in found):
+                return [
+                    (f"{one.node_namespace.rstrip('/')}/{one.node_name}", bytes(one.endpoint_gid))
+                    for one in found
+                ]
+            time.sleep(0.01)
+
+    def lateness(self, header: Any, info: Any) -> tuple[float | None, float]:
+        """What a message took from its stamp on, None without a stamp, and when it arrived [s]."""
+        now, received = time.monotonic(), info.get("received_timestamp", 0)
+        waited = 1e-9 * (time.time_ns() - received) if received else 0.0  # in the queue
+        waited = waited if 0 <= waited < _TIMEOUT else 0.0
+        stamp = 0 if header is None else header.stamp.sec * 1_000_000_000 + header.stamp.nanosec
+        late = 1e-9 * (self.node.get_clock().now().nanoseconds - stamp) - waited if stamp else None
+        return late, now - waited
+
+    def _take(self, message: Any, info: Any) -> None:
+        late, arrived = self.lateness(message.header, info)
+        parts = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
+        sender = (info.get("publisher_gid") or {}).get("data") or tuple(message.name)
+        self._states.take(message.name, parts, sender, late, arrived)
+
+    def _called(self, sender: Any) -> str:
+        """Node of a publisher; where the middleware does not tell, what it sends."""
+        there = {gid: name for name, gid in self.publishers(self._states_topic)}
+        return f"node {there[sender]}" if sender in there else f"a node ({sender!r})"
+
+    def _take_force(self, message: Any, info: Any) -> None:
+        self._force = message.data, self.lateness(None, info)[1]
+
+    def _first(self, came: Callable[[], bool], problem: Callable[[], str]) -> None:
         end = time.monotonic() + _TIMEOUT
-        while kind not in self._newest:
+        while not came():
             if time.monotonic() > end:
-                raise BusError(f"ROS 2 node '{self.node.get_name()}'", problem)
+                raise BusError(self._states_topic, problem())
             time.sleep(0.005)
-        return self._newest[kind]
+
+    def _newest(self, part: str, ids: Sequence[str]) -> list[Value | None]:
+        return self._states.newest(part, ids, time.monotonic())
 
     def _read(self) -> BusReading:
-        message, taken = self._first("states", f"nothing is received on {self._states_topic}")
-        at = {name: k for k, name in enumerate(message.name)}
-        absent = [c.id for c in (*self.wiring.motors, *self.wiring.joints) if c.id not in at]
-        if len(message.position) != len(message.name):
-            problem = f"{len(message.name)} names and {len(message.position)} positions"
-            raise BusError(self._states_topic, problem)
-        if absent:
-            problem = f"has no '{', '.join(map(str, absent))}'; it has: {', '.join(message.name)}"
-            raise BusError(self._states_topic, problem)
-        motors, joints = (
-            [float(message.position[at[one.id]]) for one in channels]
-            for channels in (self.wiring.motors, self.wiring.joints)
-        )
-        if not all(map(math.isfinite, [*motors, *joints])):
-            raise BusError(self._states_topic, "a position is NaN or infinite")
+        n = len(self.wiring.motors)
+        positions = [
+            one for one in self._newest("position", self._ids) if one is not None
+        ]  # all came at first
+        motors, joints = positions[:n], positions[n:]
+        oldest = min(range(n), key=lambda k: motors[k].taken)
+        taken = motors[oldest].taken
+
+        def beside(part: str) -> list[float]:
+            """Of each motor, if it comes with the positions."""
+            found = self._newest(part, self._ids[:n])
+            return [
+                math.nan if one is None or one.taken < at.taken - 2 * self.limits.period else one.number
+                for one, at in zip(found, motors, strict=True)
+            ]
+
         still = self.limits.still / self.limits.still_for
-        moving = len(message.velocity) == len(message.name) and any(
-            abs(message.velocity[at[one.id]]) / one.per_unit > still for one in self.wiring.motors
-        )
+        speeds = [
+            abs(x) / one.per_unit for x, one in zip(beside("velocity"), self.wiring.motors, strict=True)
+        ]
+        load = beside("effort")
         force, force_taken = [], math.inf
         if self.wiring.fingertips:
-            array, force_taken = self._first("fingertips", "no fingertips are received")
-            force = self._forces(array.data)
-        has_load = len(message.effort) == len(message.name)
-        load = [float(message.effort[at[one.id]]) for one in self.wiring.motors] if has_load else []
-        joints_taken = taken if joints else math.inf
-        return BusReading(motors, taken, moving, joints, joints_taken, force, force_taken, load)
+            self._first(lambda: self._force is not None, lambda: "no fingertips are received")
+            data, force_taken = self._force or ((), 0.0)
+            force = self._forces(data)
+        return BusReading(
+            motors=[one.number for one in motors],
+            taken=taken,
+            moving=any(x > still for x in speeds),
+            joints=[one.number for one in joints],
+            joints_taken=min((one.taken for one in joints), default=math.inf),
+            fingertips=force,
+            fingertips_taken=force_taken,
+            load=load if all(map(math.isfinite, load)) else (),
+            oldest=f"'{self._ids[oldest]}'",
+        )
 
     def _forces(self, data: Sequence[float]) -> list[float]:
         found = []
@@ -185,6 +253,8 @@ class Ros2Plant(HandDriver):
             self._executor.shutdown(timeout_sec=1.0)
             self.node.destroy_node()
             self._context.shutdown()
+        if self._master is not None:
+            self._master.release()
 
 
 class RosPose:
@@ -198,22 +268,24 @@ class RosPose:
 
     def __init__(self, plant: Ros2Plant, topic: str, frame: str) -> None:
         self._plant, self._topic, self._frame = plant, topic, frame
-        self._newest: Any = None
-        message = require("geometry_msgs.msg").PoseStamped
-        plant.node.create_subscription(message, topic, self._take, 1)
+        self._clock, self._began = SenderClock(), time.monotonic()
+        self._newest: tuple[Any, float] | None = None
+        plant.subscribe(require("geometry_msgs.msg").PoseStamped, topic, self._take)
 
-    def _take(self, message: Any) -> None:
-        self._newest = message
+    def _take(self, message: Any, info: Any) -> None:
+        self._newest = message, self._clock.taken(*self._plant.lateness(message.header, info))
 
     def __call__(self) -> Sighting | None:
-        """The newest pose; None: there was none yet.
+        """The newest pose, dated by its stamp, or by its arrival without one; None: there was none yet.
 
         Raises:
-            BusError: it is in another frame, or its orientation is no rotation.
+            BusError: nobody publishes the topic; it is in another frame, or its orientation is no rotation.
         """
-        message = self._newest
-        if message is None:
+        if self._newest is None:
+            if time.monotonic() - self._began > _DISCOVERED and not self._plant.publishers(self._topic):
+                raise BusError(self._topic, "no node publishes it: is the camera's node running?")
             return None
+        message, taken = self._newest
         if message.header.frame_id != self._frame:
             there = message.header.frame_id
             raise BusError(
@@ -224,5 +296,4 @@ class RosPose:
             raise BusError(self._topic, "the orientation is no unit quaternion")
         rotation = require("scipy.spatial.transform").Rotation.from_quat([r.x, r.y, r.z, r.w])
         position = torch.tensor([o.x, o.y, o.z], dtype=torch.float64)
-        taken = self._plant.taken(message.header.stamp)
         return Sighting(position, torch.from_numpy(rotation.as_matrix()), taken)

@@ -94,6 +94,10 @@ class LinedTable(TomlTable):
         """Of the table's head, from 1 on; 0: it has none."""
         return self.lines.get("", 0)
 
+    def where(self, key: str) -> str:
+        """A key, and the line where it stands."""
+        return f"'{key}' ({self.path}:{self.lines.get(key, self.line)})"
+
     def error(self, problem: str) -> DescriptionError:
         named = (key for name in _QUOTED.findall(problem) for key in (name, f"{name}_deg"))
         keys = (key for key in named if key in self.lines)
@@ -200,6 +204,11 @@ class Wiring:
             raise given.error(f"'{error.name}' must be {error.valid}, got {error.value}") from None
         table = LinedTable(path, "[bus]", data.get("bus", {}), bus, lines.get("bus", {}))
         return cls(path, driver, hand, tuple(motors), tuple(joints), tuple(fingertips), limits, table, lines)
+
+    def error(self, kind: str, one: Channel, problem: str, key: str = "") -> DescriptionError:
+        """Of a motor, joint or fingertip, with the line of a key or of its table's head."""
+        place = f"{self.path}:{self.line(kind, one.name, key)}"
+        return DescriptionError(place, f"[[{kind}]] '{one.name}': {problem}")
 
     def line(self, kind: str, name: str, key: str = "") -> int:
         """Line of a key of the motor, joint or fingertip ``name``, or of its table's head; 0: it has none."""

@@ -70,6 +70,8 @@ class _Checked:
         except EKMError as error:
             yield Check("sensors", "error", str(error), "correct this first")
             return
+        for note in getattr(self.plant, "notes", ()):
+            yield Check("bus", "ok", note)
         yield from self._clock(seen)
         yield self._dtype(seen)
         sensed = seen.info.get("sensed", self.hand.joint_names)

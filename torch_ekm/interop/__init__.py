@@ -14,7 +14,7 @@ from .online_regressor import OnlineRegressor
 from .river_residual import RiverResidual
 
 if TYPE_CHECKING:
-    from .bags import read_bag
+    from .bags import BagTable, read_bag
     from .casadi_residual import CasadiResidual as to_casadi  # noqa: N813
     from .lerobot_dataset import log_to_lerobot
     from .mcap_log import log_to_mcap
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from .river_regressor import RiverRegressor as as_river  # noqa: N813
 
 _ASKED_FOR = {
+    "BagTable": ("bags", "BagTable"),
     "as_river": ("river_regressor", "RiverRegressor"),
     "log_to_lerobot": ("lerobot_dataset", "log_to_lerobot"),
     "log_to_mcap": ("mcap_log", "log_to_mcap"),
@@ -39,6 +40,7 @@ def __getattr__(name: str) -> Any:
 
 
 __all__ = [
+    "BagTable",
     "OnlineRegressor",
     "RiverResidual",
     "as_river",

@@ -2,41 +2,56 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterator, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .._extras import require
 from .._files import check_file
 from ..exceptions import DescriptionError, UnknownNameError
 from ..typing import Array
 
+Numbers = NDArray[np.integer[Any]]
+
 AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
 
 _LARGEST = 16 << 30  # bytes
 _MOST = 64  # numbers of one field; more is an image or a cloud
 _LEFT_OUT = ("header", "layout")  # stamps and array shapes
+_HELD = 10  # mean intervals of a column that a value stands for; later the sensor is silent
+_BACK = 0.1  # [s] a clock that falls by more was set back
+_EARLY, _LATE = -0.02, 1.0  # [s] from header.stamp to the log's time, where both are one clock's
 
 
 class BagTable(NamedTuple):
-    """A recording as numbers: one row for each moment, in the order of time."""
+    """A recording as numbers: one row for each moment, in the order of time within each run."""
 
     names: tuple[str, ...]
     """``/topic.field.joint`` or ``/topic.field[0]``, of each column."""
     time: Array
-    """Of the recording's clock, from its first row on [s] ``(n,)``."""
+    """From the first row on, by the recording's clock [s] ``(n,)``; it goes back where a run begins."""
     values: Array
-    """``(n, columns)``, in the messages' own units."""
+    """``(n, columns)``, in the messages' own units; NaN: not known at that time."""
+    age: Array
+    """How old each value is [s] ``(n, columns)``; NaN: there was none."""
+    run: Numbers
+    """Number of the run of each row ``(n,)``: another one begins where a clock was set back."""
+    notes: tuple[str, ...] = ()
+    """What was found of clocks and latencies."""
 
 
 def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTable:
-    """A recording as a table: a row for each message of ``clock``, with the last message of each other topic.
+    """A recording as a table: a row for each message of ``clock``, with the newest values of other topics.
 
-    Nothing of the future enters a row. Rows before every topic had its first message are left out, and so are
-    texts, headers and fields of more than 64 numbers.
+    Nothing of the future enters a row. A message counts from its ``header.stamp`` on, where that runs with
+    the log's clock, at most 1 s before it; else from when it was logged. A value is NaN before its first
+    message, where its array has got shorter, and once it is older than ten mean intervals of its column.
+    Texts, headers and fields of more than 64 numbers are left out.
 
     Args:
         path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
@@ -45,14 +60,13 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
 
     Raises:
         MissingExtraError: ``rosbags`` is not installed.
-        DescriptionError: there is no such recording, it cannot be read, or no row is complete.
+        DescriptionError: there is no such recording, it cannot be read, or ``clock`` has no message.
         UnknownNameError: there is no such topic; the message lists them.
     """
     path = Path(path)
     for file in path.iterdir() if path.is_dir() else [path]:
         check_file(file, "recording", _LARGEST)
-    heard: dict[str, float] = {}
-    rows: list[tuple[int, dict[str, float]]] = []
+    heard: dict[str, _Topic] = {}
     try:
         reader = AnyReader([path], default_typestore=_typesys.get_typestore(_typesys.Stores.LATEST))
         with reader:
@@ -61,32 +75,152 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
                 if topic not in there:
                     raise UnknownNameError("topic", topic, there)
             wanted = {clock, *(topics or there)}
-            connections = [one for one in reader.connections if one.topic in wanted]
-            due: int | None = None  # messages of one moment belong together, whichever comes first
-            for connection, stamp, raw in reader.messages(connections=connections):
-                if due is not None and stamp > due:
-                    rows.append((due, dict(heard)))
-                    due = None
-                message = reader.deserialize(raw, connection.msgtype)
-                heard.update(_numbers(message, connection.topic))
-                if connection.topic == clock:
-                    due = stamp
-            if due is not None:
-                rows.append((due, dict(heard)))
+            for place, (topic, kind, logged, raw) in enumerate(_written(reader, wanted)):
+                one = heard.setdefault(topic, _Topic(topic))
+                one.take(place, logged, reader.deserialize(raw, kind))
     except UnknownNameError:
         raise
     except FileNotFoundError:
         raise DescriptionError(path, "there is no such recording") from None
     except Exception as error:  # a damaged recording fails in any way that its format can think of
         raise DescriptionError(path, f"this recording cannot be read: {error}") from error
-    complete = [(stamp, row) for stamp, row in rows if len(row) == len(heard)]
-    if not complete:
-        raise DescriptionError(
-            path, f"no message of '{clock}' comes after the first message of every other topic"
-        )
-    first = complete[0][0]
-    time = np.array([1e-9 * (stamp - first) for stamp, _ in complete])
-    return BagTable(tuple(heard), time, np.array([[row[name] for name in heard] for _, row in complete]))
+    if clock not in heard:
+        raise DescriptionError(path, f"the topic '{clock}' has no message, and its messages set the rows")
+    return _table(clock, heard)
+
+
+@dataclass
+class _Topic:
+    """What was heard of one topic, in the order of writing."""
+
+    name: str
+    place: list[int] = field(default_factory=list)
+    """In the file."""
+    logged: list[int] = field(default_factory=list)
+    """[ns]"""
+    stamp: list[int] = field(default_factory=list)
+    """``header.stamp`` [ns]; 0: none."""
+    columns: dict[str, tuple[list[int], list[float]]] = field(default_factory=dict)
+    """Numbers of the messages that say something of a column, and what; NaN: it is gone."""
+
+    def take(self, place: int, logged: int, message: Any) -> None:
+        number, found = len(self.place), dict(_numbers(message, self.name))
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        self.place.append(place)
+        self.logged.append(logged)
+        self.stamp.append(0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec)
+        for name, value in found.items():
+            at, values = self.columns.setdefault(name, ([], []))
+            at.append(number)
+            values.append(value)
+        for name, (at, values) in self.columns.items():
+            if "[" in name and name not in found and not np.isnan(values[-1]):  # names may take turns
+                at.append(number)
+                values.append(np.nan)
+
+    def fell(self) -> list[tuple[int, int]]:
+        """Places in the file between which its clock was set back: few; else two clocks take turns."""
+        places: list[tuple[int, int]] = []
+        for times in (self.logged, self.stamp):
+            fallen = np.flatnonzero(np.diff(times) < -1e9 * _BACK)
+            if len(fallen) <= max(1, len(times) // 20):
+                places += [(self.place[k], self.place[k + 1]) for k in fallen]
+        return places
+
+    def measured(self, begin: int) -> tuple[Array, str]:
+        """When each message counts [s from a time of the log on], and what is to be said of it."""
+        logged, stamp = (1e-9 * (np.array(times) - begin) for times in (self.logged, self.stamp))
+        if not any(self.stamp) or len(set(self.stamp)) < len(stamp) / 2:  # none, or it stands
+            return logged, ""
+        late = logged - stamp
+        if np.mean((late > _EARLY) & (late < _LATE)) < 0.95:  # a network may hang for a moment
+            off = float(np.median(late))
+            return logged, f"{self.name} has a header.stamp {off:.4g} s before it was logged: not used"
+        middle, most = 1e3 * float(np.median(late)), 1e3 * float(late.max())
+        said = f"{self.name} counts from its header.stamp, {middle:.3g} ms before it was logged"
+        return stamp, f"{said} (at most {most:.3g} ms)" if most >= 1 else ""
+
+
+def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
+    starts: list[int] = []  # in the file, of all runs but the first
+    for after, place in sorted((fall for one in heard.values() for fall in one.fell()), key=lambda x: x[1]):
+        if not starts or starts[-1] <= after:  # else it is the one that another topic has shown
+            starts.append(place)
+    order, notes = [clock, *(name for name in heard if name != clock)], []
+    when = {name: heard[name].measured(heard[clock].logged[0]) for name in order}
+    run = {name: np.searchsorted(starts, heard[name].place, side="right") for name in order}
+    rows = np.lexsort((when[clock][0], run[clock]))
+    time, runs = when[clock][0][rows], run[clock][rows]
+    if starts:
+        notes.append(f"{len(np.unique(runs))} runs: a clock was set back")
+    notes += [said for _, said in when.values() if said]
+    names, values, ages = [], [], []
+    for topic in order:
+        for name, (at, given) in heard[topic].columns.items():
+            value, age = _held(time, runs, when[topic][0][at], run[topic][at], np.array(given))
+            names.append(name)
+            values.append(value)
+            ages.append(age)
+    _, number = np.unique(runs, return_inverse=True)
+    shape = (len(names), len(time))
+    values, ages = np.reshape(values, shape).T, np.reshape(ages, shape).T
+    return BagTable(tuple(names), time - time[0], values, ages, number, tuple(notes))
+
+
+def _held(time: Array, runs: Numbers, at: Array, run: Numbers, given: Array) -> tuple[Array, Array]:
+    """Of each row the newest value of its run, and its age; NaN: there is none, or it is too old."""
+    order = np.lexsort((at, run))
+    at, run, given = at[order], run[order], given[order]
+    steps = np.diff(at)[np.diff(run) == 0]
+    most = _HELD * steps.mean() if len(steps) > 1 else np.inf
+    value, age = np.full(len(time), np.nan), np.full(len(time), np.nan)
+    for one in np.unique(run):
+        mine, rows = run == one, np.flatnonzero(runs == one)
+        last = np.searchsorted(at[mine], time[rows], side="right") - 1
+        known = last >= 0
+        rows, last = rows[known], last[known]
+        age[rows] = time[rows] - at[mine][last]
+        value[rows] = np.where(age[rows] <= most, given[mine][last], np.nan)
+    return value, age
+
+
+def _written(reader: Any, topics: set[str]) -> Iterator[tuple[str, str, int, bytes]]:
+    """Topic, type, time of the log [ns] and bytes, in the order of writing: only there a clock goes back.
+
+    Where the storage does not tell, in the order of time.
+    """
+    for bag in reader.readers:
+        storage = getattr(bag, "storage", None)
+        packed = getattr(getattr(storage, "metadata", None), "compression_mode", None) == "message"
+        for part in [bag] if packed else getattr(storage, "storages", [storage or bag]):
+            wanted = [one for one in part.connections if one.topic in topics]
+            if not wanted:
+                continue
+            if hasattr(part, "messages_scan"):
+                found = part.messages_scan(wanted)
+            elif getattr(part, "dbconn", None) is not None:
+                found = _rows(part, wanted)
+            elif hasattr(part, "indexes"):
+                found = _by_place(part, wanted)
+            else:
+                found = part.messages(wanted)
+            for connection, logged, raw in found:
+                yield connection.topic, connection.msgtype, logged, raw
+
+
+def _rows(database: Any, wanted: list[Any]) -> Iterator[tuple[Any, int, bytes]]:
+    """Of rosbag2's sqlite3."""
+    by_id, ask = {one.id: one for one in wanted}, "SELECT topic_id, timestamp, data FROM messages ORDER BY id"
+    for topic, logged, raw in database.dbconn.cursor().execute(ask):
+        if topic in by_id:
+            yield by_id[topic], logged, raw
+
+
+def _by_place(bag: Any, wanted: list[Any]) -> list[tuple[Any, int, bytes]]:
+    """Of a bag of ROS 1, which gives messages in the order of its index."""
+    index = heapq.merge(*(bag.indexes[one.id] for one in wanted))
+    pairs = zip(index, bag.messages(wanted), strict=True)
+    return [message for _, message in sorted(pairs, key=lambda one: (one[0].chunk_pos, one[0].offset))]
 
 
 def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
@@ -94,15 +228,15 @@ def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
     if is_dataclass(value):
         given = getattr(value, "name", None)
         labels = given if isinstance(given, list) else []
-        for field in fields(value):
-            part = getattr(value, field.name)
-            if field.name in _LEFT_OUT or field.name.startswith("__"):
+        for one in fields(value):
+            part = getattr(value, one.name)
+            if one.name in _LEFT_OUT or one.name.startswith("__"):
                 continue
             if labels and isinstance(part, np.ndarray) and len(part) == len(labels):
-                for label, one in zip(labels, part, strict=True):
-                    yield f"{place}.{field.name}.{label}", float(one)
+                for label, number in zip(labels, part, strict=True):
+                    yield f"{place}.{one.name}.{label}", float(number)
             else:
-                yield from _numbers(part, f"{place}.{field.name}")
+                yield from _numbers(part, f"{place}.{one.name}")
     elif isinstance(value, bool | int | float | np.number | np.bool_):
         yield place, float(value)
     elif isinstance(value, list | np.ndarray) and len(value) <= _MOST:

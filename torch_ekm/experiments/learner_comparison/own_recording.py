@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,7 @@ class OwnRecording:
         y: what the model left over ``(n, m)``, in the units of the observation.
         about: what it is, and what "the model alone" predicts.
         outputs: the observed columns.
+        notes: which rows are left out and why, and what was found of clocks.
     """
 
     name: str
@@ -50,6 +52,7 @@ class OwnRecording:
     y: Float[Tensor, "n m"]
     about: str
     outputs: tuple[str, ...] = ()
+    notes: str = ""
 
     def stream(self, limit: int | None = None) -> Stream:
         """For :func:`compare`: the first ``limit`` motions (None: all), in units of their first tenth.
@@ -57,7 +60,8 @@ class OwnRecording:
         That (20 to 200 samples) is not scored. Only x is centred: 0 is what the model says.
         """
         x, y = self.x.numpy(), self.y.numpy()
-        return in_own_units(self.name, x, y, self.about, limit, outputs=self.outputs, centre_y=False, ddof=1)
+        found = in_own_units(self.name, x, y, self.about, limit, outputs=self.outputs, centre_y=False, ddof=1)
+        return replace(found, notes=self.notes)
 
 
 def load_own(
@@ -71,7 +75,8 @@ def load_own(
     """Motions from CSV, Parquet, or a recording of ROS (MCAP, sqlite3, .bag).
 
     Args:
-        path: the file, or the folder of rosbag2; rows in the order of time.
+        path: the file, or the folder of rosbag2; rows in the order of time. No motion goes over a row that
+            is left out, or from one run into another.
         columns: which column is what.
         model: f; None: nothing moves.
         clock: in a recording of ROS, the topic whose messages set the rows, such as that of the commands.
@@ -89,10 +94,12 @@ def load_own(
     names, read = open_table(path, clock)
     roles = columns.state, columns.command, columns.observation
     state, command, outputs = (find_columns(wanted, names) for wanted in roles)
-    known, commanded, seen = read(state), read(command), read(outputs)
-    starts = np.arange(0, len(seen) - every, every)
+    values, part, notes = read([*state, *command, *outputs])
+    known, commanded, seen = np.split(values, np.cumsum([len(state), len(command)]), axis=1)
+    bounds = np.flatnonzero(np.diff(part, prepend=-1, append=-1))  # no motion from one part into another
+    starts = np.concatenate([np.arange(begin, end - every, every) for begin, end in pairwise(bounds)])
     if len(starts) < LEAST:
-        problem = f"it has {len(starts)} motions of {every} rows; at least {LEAST} are needed"
+        problem = f"it has {len(starts)} motions of {every} rows; at least {LEAST} are needed.{notes}"
         raise DescriptionError(path, problem)
     sums = np.vstack([np.zeros(len(command)), commanded.cumsum(0)])
     s, u = known[starts], (sums[starts + every] - sums[starts]) / every
@@ -104,4 +111,4 @@ def load_own(
     alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
     about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
     x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
-    return OwnRecording(path.stem, x, y, about, tuple(outputs))
+    return OwnRecording(path.stem, x, y, about, tuple(outputs), notes)

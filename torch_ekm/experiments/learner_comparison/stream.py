@@ -123,12 +123,12 @@ def load_table(
     if both := [name for name in chosen if name in outputs]:
         raise DescriptionError(path, f"column '{both[0]}' cannot be both input and target")
     groups = [chosen, outputs, model, runs]  # read at once, so that holes are counted in all of them
-    values = np.split(
-        read([name for one in groups for name in one]), np.cumsum([len(one) for one in groups[:-1]]), axis=1
-    )
+    rows = read([name for one in groups for name in one])
+    values = np.split(rows.values, np.cumsum([len(one) for one in groups[:-1]]), axis=1)
     x, y = values[0], values[1] - (values[2] if model else 0.0)
     if len(x) < LEAST:
-        raise DescriptionError(path, f"it has {len(x)} samples; at least {LEAST} are needed to compare")
+        few = f"it has {len(x)} samples; at least {LEAST} are needed to compare"
+        raise DescriptionError(path, f"{few}.{rows.about}" if rows.about else few)
     zero_is_model = bool(model) or all(map(_is_residual, outputs))
     alone = ", ".join(model) if model else "0" if zero_is_model else "the mean of the first tenth"
     about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}; alone: {alone}"
@@ -136,7 +136,7 @@ def load_table(
     parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
     if runs and 3 * len(parts) > len(x[:limit]):
         raise ParameterError("run", runs[0], "a column that is the same in all rows of a run")
-    notes = _other_order(values[1], values[2], outputs, model) if len(model) > 1 else ""
+    notes = rows.about + (_other_order(values[1], values[2], outputs, model) if len(model) > 1 else "")
     if clocks := [name for name, column in zip(chosen, x.T, strict=True) if _is_clock(column, len(parts))]:
         notes += f" Like a clock or the number of a row, to be left out: {', '.join(clocks)}."
     if numbers := [name for name, column in zip(chosen, x.T, strict=True) if _is_number_of_run(column)]:

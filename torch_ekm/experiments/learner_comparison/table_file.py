@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ... import interop
 from ...exceptions import DescriptionError, ParameterError, UnknownNameError
+from ...typing import Array
 from .csv_file import Names, Read, open_csv
 from .parquet_file import open_parquet
 
@@ -17,9 +24,23 @@ _READERS = {
 }  # fmt: skip
 _MOST_COLUMNS = 4096
 _INDEXED = re.compile(r"(.+)\[([0-9]{1,4})\]")
+_TIME = re.compile(r"(time|timestamp|stamp)([ _]?[\[(]?(s|ms|us|ns|sec|seconds)[\])]?)?", re.IGNORECASE)
 
 
-def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[Names, Read]:
+class Rows(NamedTuple):
+    """Rows of a table in which nothing is missing, in the order of time."""
+
+    values: Array
+    """``(n_rows, n)`` of the columns that were asked for."""
+    part: NDArray[np.integer[Any]]
+    """Number of each row's unbroken part: another begins with a run, and after rows that are left out."""
+    about: str = ""
+    """Which rows are left out and why, and what was found of clocks; sentences that begin with a blank."""
+
+
+def open_table(
+    path: Path, clock: str | None = None, label: str = ""
+) -> tuple[Names, Callable[[Sequence[str]], Rows]]:
     """Column names, and a function that reads some of the columns, rows in the order of time.
 
     CSV (``.csv``, ``.tsv``, ``.txt``), see :func:`open_csv`, or Parquet (``.parquet``), see
@@ -42,8 +63,8 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
             raise ParameterError(
                 "clock", clock, "a topic whose messages set the rows, such as that of the commands"
             )
-        heard, _, values = interop.read_bag(path, clock)
-        return heard, lambda wanted: values[:, [heard.index(name) for name in wanted]]
+        bag = interop.read_bag(path, clock)
+        return bag.names, partial(_bag_rows, path, bag)
     if kind not in _READERS:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
     names, read = _READERS[kind](path, label)
@@ -57,7 +78,60 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
         if name in known:
             raise DescriptionError(path, f"two columns are called '{name}'")
         known.add(name)
-    return names, read
+    return names, partial(_file_rows, names, read)
+
+
+def _file_rows(names: Names, read: Read, wanted: Sequence[str]) -> Rows:
+    """Another run begins where a column that is called time goes back."""
+    values = read(wanted)
+    part, about = np.zeros(len(values), dtype=int), ""
+    for clock in [name for name in names if _TIME.fullmatch(name)][:1]:
+        with contextlib.suppress(DescriptionError):  # dates, or with holes
+            back = np.diff(read([clock])[:, 0]) < 0
+            if 20 * back.sum() > len(back):
+                first = int(back.argmax()) + 2
+                problem = f"goes back in {back.sum()} of {len(values)} rows, first in row {first}"
+                about = f" Column '{clock}' {problem}: rows should be in the order of time."
+            elif back.any():
+                part = np.append(0, back.cumsum())
+                about = f" {part[-1] + 1} runs: column '{clock}' goes back."
+    return Rows(values, part, about)
+
+
+def _bag_rows(path: Path, bag: interop.BagTable, wanted: Sequence[str]) -> Rows:
+    """The complete ones."""
+    at = [bag.names.index(name) for name in wanted]
+    values, n = bag.values[:, at], len(bag.time)
+    missing = ~np.isfinite(values)
+    kept = np.flatnonzero(~missing.any(axis=1))
+    why: dict[str, list[str]] = {}  # columns of one topic mostly miss alike
+    for name, gone in dict(zip(wanted, missing.T, strict=True)).items():
+        if gone.any():
+            why.setdefault(f"{name.partition('.')[0]}*{_gaps(gone, bag.time)}", []).append(name)
+    because = [
+        (names[0] if len(names) == 1 else f"{text.partition('*')[0]} ({len(names)} columns, {names[0]})")
+        + text.partition("*")[2]
+        for text, names in why.items()
+    ]
+    left = f"{len(kept)} of {n} rows, because {', '.join(because)}"
+    if not len(kept):
+        raise DescriptionError(path, f"{left}: leave such columns out")
+    broken = (np.diff(kept) > 1) | (np.diff(bag.run[kept]) != 0)
+    notes = [*bag.notes, *([left] if because else [])]
+    return Rows(values[kept], np.append(0, broken.cumsum()), "".join(f" {one}." for one in notes))
+
+
+def _gaps(gone: NDArray[np.bool_], time: Array) -> str:
+    """When a column has no finite value, in words."""
+    there = np.flatnonzero(~gone)
+    if not len(there):
+        return " has no finite value"
+    first, last = there[0], there[-1]
+    if gone.sum() == first:
+        return f" begins at {time[first]:.4g} s"
+    if gone.sum() == len(gone) - 1 - last:
+        return f" ends at {time[last]:.4g} s"
+    return f" is silent or not finite in {gone.sum()} rows, first at {time[gone.argmax()]:.4g} s"
 
 
 def find_columns(wanted: str | Sequence[str], names: Sequence[str]) -> list[str]:

@@ -1,0 +1,218 @@
+"""Recordings as ros2_control, Gazebo, a LEAP hand and an arm beside a hand leave them: with holes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from torch_ekm.exceptions import DescriptionError
+from torch_ekm.experiments import Columns, load_own
+from torch_ekm.experiments.learner_comparison.stream import load_table
+from torch_ekm.interop import read_bag
+
+typesys = pytest.importorskip("rosbags.typesys", reason="extra 'interop'")
+from rosbags import rosbag1, rosbag2  # noqa: E402
+
+TYPES = {
+    kind: typesys.get_typestore(getattr(typesys.Stores, "ROS1_NOETIC" if kind == "ros1" else "LATEST"))
+    for kind in ("ros1", "ros2")
+}
+Heard = tuple[float, str, Any]  # logged [s], topic, message without header or (type, its fields)
+
+
+class Maker:
+    """Messages of ROS 1 or 2."""
+
+    def __init__(self, kind: str = "mcap") -> None:
+        self.kind, self.types = kind, TYPES["ros1" if kind == "ros1" else "ros2"]
+
+    def make(self, kind: str, *values: Any, **named: Any) -> Any:
+        return self.types.types[kind](*values, **named)
+
+    def header(self, stamp: float) -> Any:
+        ns = round(1e9 * stamp)
+        time = self.make("builtin_interfaces/msg/Time", ns // 10**9, ns % 10**9)
+        return self.make("std_msgs/msg/Header", *([0] if self.kind == "ros1" else []), time, "")
+
+    def joints(self, stamp: float, names: Iterable[str], position: Any, effort: Any = ()) -> Any:
+        arrays = [np.array(x, dtype=float) for x in (position, (), effort)]
+        return self.make("sensor_msgs/msg/JointState", self.header(stamp), list(names), *arrays)
+
+    def array(self, *values: float) -> Any:
+        layout = self.make("std_msgs/msg/MultiArrayLayout", [], 0)
+        return self.make("std_msgs/msg/Float64MultiArray", layout, np.array(values, dtype=float))
+
+    def write(self, folder: Path, heard: Iterable[Heard]) -> Path:
+        path = folder / ("own.bag" if self.kind == "ros1" else "own")
+        if self.kind == "ros1":
+            writer: Any = rosbag1.Writer(path)
+        else:
+            plugin = getattr(rosbag2.StoragePlugin, self.kind.upper())
+            writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+        topics: dict[str, Any] = {}
+        pack = self.types.serialize_ros1 if self.kind == "ros1" else self.types.serialize_cdr
+        with writer:
+            for logged, topic, message in heard:
+                kind = message.__msgtype__
+                topics[topic] = topics.get(topic) or writer.add_connection(topic, kind, typestore=self.types)
+                writer.write(topics[topic], round(1e9 * logged), pack(message, kind))
+        return path
+
+
+@pytest.fixture
+def ros() -> Maker:
+    return Maker()
+
+
+def column(table: Any, name: str) -> np.ndarray:
+    return table.values[:, table.names.index(name)]
+
+
+def ros2_control(ros: Maker, n: int = 120, battery: float = 2.0) -> list[Heard]:
+    """Effort is NaN where a joint has none; a topic that nobody asks for begins late."""
+    heard: list[Heard] = []
+    for k in range(n):
+        t = 100 + 0.02 * k
+        heard.append((t, "/joint_states", ros.joints(t, "ab", [np.sin(k), 0.1 * k], [np.nan, np.nan])))
+        heard.append((t + 0.001, "/commands", ros.array(np.cos(k))))
+        if t - 100 >= battery:
+            heard.append((t + 0.002, "/battery", ros.array(12.0)))
+    return heard
+
+
+def test_what_nobody_asks_for_costs_no_row(ros, tmp_path) -> None:
+    path = ros.write(tmp_path, ros2_control(ros))
+    table = read_bag(path, "/commands")
+    assert table.values.shape == (120, 6)
+    assert np.isnan(column(table, "/joint_states.effort.a")).all()
+    which = Columns(["/joint_states.position*"], ["/commands.data[0]"], ["/joint_states.position.a"])
+    own = load_own(path, which, clock="/commands")
+    assert (len(own.x), own.notes) == (119, "")
+    late = Columns([*which.state, "/battery.data[0]"], which.command, which.observation)
+    own = load_own(ros.write(tmp_path / "late", ros2_control(ros, battery=1.0)), late, clock="/commands")
+    assert len(own.x) == 68
+    assert own.notes == " 69 of 120 rows, because /battery.data[0] begins at 1.02 s."
+    assert own.stream().notes == own.notes
+
+
+def test_what_is_never_finite_is_named(ros, tmp_path) -> None:
+    path = ros.write(tmp_path, ros2_control(ros))
+    inputs = ["/joint_states*"]
+    problem = (
+        r"0 of 120 rows, because /joint_states \(2 columns, /joint_states.effort.a\) has no finite value"
+    )
+    with pytest.raises(DescriptionError, match=problem):
+        load_table(path, ["/commands.data[0]"], inputs=inputs, clock="/commands")
+
+
+def test_nothing_is_held_for_ever(ros, tmp_path) -> None:
+    """An array that is emptied, one that grows, a sensor that dies and one that pauses; a row is 20 ms."""
+    heard: list[Heard] = []
+    for k in range(100):
+        t = 1 + 0.02 * k
+        heard.append((t, "/forces", ros.array(*([3.0] if k < 50 else [4.0, 5.0] if k >= 70 else []))))
+        if k < 60:
+            heard.append((t, "/dies", ros.array(k)))
+        if not 30 <= k < 60:
+            heard.append((t, "/pauses", ros.array(k)))
+        heard.append((t + 0.001, "/u", ros.array(k)))
+    heard.insert(0, (0.99, "/once", ros.array(7.0)))
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/forces.data[0]")[[49, 50, 69, 70]] == pytest.approx(
+        [3, np.nan, np.nan, 4], nan_ok=True
+    )
+    assert np.isnan(column(table, "/forces.data[1]")[:70]).all()
+    assert column(table, "/dies.data[0]")[[59, 68, 70]] == pytest.approx([59, 59, np.nan], nan_ok=True)
+    assert np.isnan(column(table, "/pauses.data[0]")[46:60]).all()
+    assert column(table, "/pauses.data[0]")[[29, 39, 60]].tolist() == [29, 29, 60]
+    assert (column(table, "/once.data[0]") == 7.0).all()
+    assert table.age[:, table.names.index("/once.data[0]")][[0, 99]] == pytest.approx([0.011, 1.991])
+    which = Columns(["/pauses.data[0]"], ["/u.data[0]"], ["/pauses.data[0]"])
+    own = load_own(ros.write(tmp_path / "again", heard), which, clock="/u")
+    steps = own.y[:, 0].tolist()
+    assert max(steps) == 1.0, "no motion goes over the pause"
+    assert "because /pauses.data[0] is silent or not finite in 16 rows, first at 0.88 s" in own.notes
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_a_simulation_that_was_reset_is_two_runs(kind: str, tmp_path) -> None:
+    """Gazebo's clock goes back to its begin, and stamps fall between those of the first run."""
+    ros = Maker(kind)
+    heard: list[Heard] = []
+    for run in (0, 1):
+        for k in range(60):
+            t = 1 + 0.01 * run + 0.02 * k
+            heard.append((t, "/q", ros.array(1000 * run + k)))
+            heard.append((t, "/u", ros.array(1.0)))
+    path = ros.write(tmp_path, heard)
+    table = read_bag(path, "/q")
+    assert column(table, "/q.data[0]").tolist() == [*range(60), *range(1000, 1060)]
+    assert table.run.tolist() == [0] * 60 + [1] * 60
+    assert table.notes == ("2 runs: a clock was set back",)
+    own = load_own(path, Columns(["/q.data[0]"], ["/u.data[0]"], ["/q.data[0]"]), clock="/q")
+    assert own.y[:, 0].tolist() == [1.0] * 118
+
+
+def test_stamps_that_fall_are_a_reset_only_where_they_are_one_clock(ros, tmp_path) -> None:
+    """The log's time is the wall's; two robots whose clocks differ by 2 s take turns on one topic."""
+    heard: list[Heard] = []
+    for k in range(80):
+        t, sim = 1e6 + 0.02 * k, 5 + 0.02 * (k % 40)
+        heard.append((t, "/q", ros.joints(sim, "a", [k])))
+        heard.append((t + 0.001, "/both", ros.joints(t - 2 * (k % 2), "xy"[k % 2], [k])))
+        heard.append((t + 0.002, "/u", ros.array(k)))
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert table.run.tolist() == [0] * 40 + [1] * 40
+    assert "/q has a header.stamp 1e+06 s before it was logged: not used" in table.notes
+
+
+def test_an_arm_and_a_hand_take_turns_on_one_topic(ros, tmp_path) -> None:
+    heard: list[Heard] = []
+    for k in range(50):
+        t = 1 + 0.02 * k
+        heard.append((t, "/joint_states", ros.joints(t, ["finger"], [k])))
+        heard.append((t + 0.005, "/joint_states", ros.joints(t + 0.005, ["elbow"], [-k])))
+        heard.append((t + 0.01, "/u", ros.array(k)))
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/joint_states.position.finger").tolist() == [*range(50)]
+    assert column(table, "/joint_states.position.elbow").tolist() == [-k for k in range(50)]
+
+
+def test_a_message_counts_from_its_stamp_and_the_latency_is_stated(ros, tmp_path) -> None:
+    """A LEAP hand's node writes unnamed arrays; here they are logged 45 ms after they were measured."""
+    heard: list[Heard] = []
+    for k in range(80):
+        t = 1 + 0.02 * k
+        heard.append((t + 0.045, "/leap", ros.joints(t, "", [k, -k])))
+        heard.append((t + 0.001, "/u", ros.array(k)))
+    heard.sort(key=lambda one: one[0])
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/leap.position[1]").tolist() == [-k for k in range(80)]
+    assert table.age[:, table.names.index("/leap.position[0]")] == pytest.approx(np.full(80, 0.001))
+    assert table.notes == ("/leap counts from its header.stamp, 45 ms before it was logged (at most 45 ms)",)
+
+
+def test_rows_are_in_the_order_of_time_whoever_wrote_them(ros, tmp_path) -> None:
+    """One topic after the other, and neighbours exchanged."""
+    heard: list[Heard] = [(1 + 0.02 * (k ^ 1), "/u", ros.array(k ^ 1)) for k in range(60)]
+    heard += [(1.001 + 0.02 * k, "/q", ros.array(k)) for k in range(60)]
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/u.data[0]").tolist() == [*range(60)]
+    assert column(table, "/q.data[0]")[1:].tolist() == [*range(59)]
+    assert not table.run.any()
+
+
+def test_a_time_in_a_csv_that_goes_back_begins_a_run(tmp_path) -> None:
+    rows = [f"{0.1 * k:.3f},{1000 * run + k},1" for run in (0, 1) for k in range(50)]
+    path = tmp_path / "own.csv"
+    path.write_text("\n".join(["time [s],q,u", *rows]))
+    own = load_own(path, Columns(["q"], ["u"], ["q"]), every=2)
+    assert own.y[:, 0].tolist() == [2.0] * 48
+    assert own.notes == " 2 runs: column 'time [s]' goes back."
+    path.write_text("\n".join(["time,q,u", *rows[::-1]]))
+    own = load_own(path, Columns(["q"], ["u"], ["q"]))
+    assert "'time' goes back in 98 of 100 rows, first in row 2" in own.notes
