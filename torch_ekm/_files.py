@@ -35,7 +35,7 @@ def check_file(path: str | os.PathLike, what: str, largest: int, refusal: Refusa
     except OSError as error:
         raise refusal(path, f"cannot be read: {error.strerror}") from None
     if not stat.S_ISREG(status.st_mode):
-        raise refusal(path, f"no such {what}: it is a folder, a pipe or a device")
+        raise refusal(path, f"no {what}: it is no file but a folder, a pipe or a device")
     if status.st_size > largest:
         raise refusal(path, f"a {what} has at most {largest} bytes, this one is larger")
     return path

@@ -44,6 +44,8 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
             )
         heard, _, values = interop.read_bag(path, clock)
         return heard, lambda wanted: values[:, [heard.index(name) for name in wanted]]
+    if not path.is_file():
+        raise DescriptionError(path, "there is no such file")
     if kind not in _READERS:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
     names, read = _READERS[kind](path, label)
