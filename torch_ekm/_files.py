@@ -91,7 +91,7 @@ def check_announced(
     there: int,
     refusal: Refusal = DescriptionError,
     *,
-    times: int = 64,
+    times: int = 32,
 ) -> None:
     """That what a file says it unpacks to goes with its size: some kB can announce some GB.
 

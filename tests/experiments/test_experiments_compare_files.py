@@ -41,7 +41,7 @@ BROKEN = {
     "holes": ("a,b,y\n1,,3\n4,5,6\n7,8,nan\n", r"line 2, column 'b' is empty.* 2 of 3 lines have"),
     "one row": ("a,b,y\n1,2,3\n", r"it has 1 samples; at least 40"),
     "header only": ("a,b,y\n", r"it has 0 samples"),
-    "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; the first line must name"),
+    "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; the first line .* must name"),
     "ragged": ("a,b,y\n1,2,3\n1,2\n", r"line 3 has 2 fields, but the header names 3"),
     "empty": ("\n \n", r"the file is empty"),
     "twice": ("a,a,y\n" + GOOD, r"two columns are called 'a'"),
@@ -92,7 +92,7 @@ def test_tables_are_read_whoever_wrote_them(case: str, encoding: str, tmp_path: 
     (tmp_path / "a.csv").write_bytes(text.encode(encoding))
     names, read = open_table(tmp_path / "a.csv")
     assert list(names) == expected
-    np.testing.assert_array_equal(read(names), ROWS)
+    np.testing.assert_array_equal(read(names).values, ROWS)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_broken_file_is_told_by_line_and_column(case: str, tmp_path: Path) -> 
 
 
 def test_other_files(tmp_path: Path) -> None:
-    with pytest.raises(DescriptionError, match="no such CSV file"):
+    with pytest.raises(DescriptionError, match="no such file"):
         load_table(tmp_path / "nothing.csv")
     (tmp_path / "a.xlsx").write_text("x")
     with pytest.raises(DescriptionError, match=r"'\.xlsx' are not read"):

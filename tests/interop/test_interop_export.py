@@ -20,7 +20,7 @@ from torch_ekm import (
     Standardize,
     default_learner,
 )
-from torch_ekm.exceptions import ParameterError
+from torch_ekm.exceptions import ParameterError, StateError
 from torch_ekm.interop import to_casadi
 from torch_ekm.residual import (
     ActionLinearKernel,
@@ -158,7 +158,7 @@ def test_casadi_names_what_it_cannot_say() -> None:
     pytest.importorskip("casadi", reason="extra 'interop'")
     with pytest.raises(ParameterError, match="RecursiveLeastSquares"):
         to_casadi(RecursiveLeastSquares(3, 2))
-    with pytest.raises(ParameterError, match="one model"):
+    with pytest.raises(StateError, match="one model"):
         to_casadi(SparseOnlineGP(3, 2, batch_shape=(2,)))
 
 

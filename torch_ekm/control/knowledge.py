@@ -16,7 +16,7 @@ from .._files import write_whole
 from .._recorded import Recorded, bound_problems, check_state, describe, make
 from ..description import HandDescription
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
-from ..exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
+from ..exceptions import EKMError, FileFormatError, ParameterError, StateError
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
@@ -156,7 +156,7 @@ class HandKnowledge(Recorded, nn.Module):
             if not isinstance(made, cls):
                 raise FileFormatError(path, f"holds a {type(made).__name__}, no {cls.__name__}")
             return made
-        except (FileFormatError, StateMismatchError) as error:
+        except EKMError as error:
             problem = error.problem if isinstance(error, FileFormatError) else str(error)
             if previous(path).is_file():
                 problem += f"; the last file that was good is {previous(path)}: copy it here to go on with it"

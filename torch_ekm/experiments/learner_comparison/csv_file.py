@@ -27,7 +27,7 @@ Records = Callable[[], Iterator[tuple[int, list[str]]]]
 _LARGEST = 128 << 20  # bytes: a figure of one digit takes four times as much in memory
 _LONGEST = 1 << 20  # characters of one record, which is a line where no quoted text has line breaks
 _SEPARATORS = ",;\t"
-_EXCEL = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
+_EXCEL = re.compile(r'"?sep=([,;\t|:^~])"?', re.IGNORECASE)
 _TRIED = 6  # records that tell which separator it is
 
 
@@ -44,7 +44,7 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
         DescriptionError: the file cannot be used; the message names line and column. The function raises
             it, too.
     """
-    content = read_file(path, "CSV file", _LARGEST)
+    content = read_file(path, "file of a table", _LARGEST)
     decode(content, path)
     before, given = _preamble(content)
     tried = [partial(_records, path, content, before, one) for one in given or _SEPARATORS]
@@ -54,7 +54,7 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
         raise DescriptionError(path, "the file is empty")
     names = _trimmed(names, len(names) - 1)
     if all(figure(field) is not None for field in names):
-        problem = "holds numbers only; the first line must name the columns"
+        problem = "holds numbers only; the first line that does not begin with # must name the columns"
         raise DescriptionError(path, f"line {number} {problem}")
     return tuple(names), partial(_read, path, tuple(names), records, label)
 

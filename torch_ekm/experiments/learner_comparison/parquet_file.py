@@ -29,7 +29,7 @@ def open_parquet(path: Path, label: str) -> tuple[Names, Read]:
     Raises:
         DescriptionError: no Parquet file, damaged, or some kB that announce GB. The function raises it, too.
     """
-    check_file(path, "Parquet file", _LARGEST)
+    check_file(path, "file of a table", _LARGEST)
     parquet = require("pyarrow.parquet")
     with told_as_damage(path, "file, or no Parquet file"), parquet.ParquetFile(path) as file:
         return tuple(file.schema_arrow.names), partial(_read, path, label)

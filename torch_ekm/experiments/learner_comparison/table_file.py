@@ -65,6 +65,8 @@ def open_table(
             )
         bag = interop.read_bag(path, clock)
         return bag.names, partial(_bag_rows, path, bag)
+    if not path.is_file():
+        raise DescriptionError(path, "there is no such file")
     if kind not in _READERS:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
     names, read = _READERS[kind](path, label)
