@@ -32,6 +32,8 @@ class StopReason(Enum):
     """By :meth:`ClosedLoop.stop`, or by Ctrl-C."""
     PLANT_FAILED = "plant failed"
     """It raised ``Stop.cause``: its bus, a sensor, a reading of the wrong length."""
+    COMMAND_REFUSED = "command refused"
+    """By the :class:`~torch_ekm.plant.Gate` or the driver, before anything moved: see ``Stop.cause``."""
     WRONG_WAY = "wrong way"
     """See :attr:`~torch_ekm.control.Guards.wrong_way`."""
     STALE_SENSOR = "stale sensor"
@@ -43,7 +45,6 @@ class StopReason(Enum):
     OUT_OF_RANGE = "reading out of range"
     FINGERTIP_FAULT = "fingertip fault"
     ACTUATOR_STUCK = "actuator stuck"
-    COMMAND_CEILING = "command ceiling"
     SPEED_CEILING = "speed ceiling"
     FORCE_CEILING = "force ceiling"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from ..exceptions import CommandRefusedError
 from ..plant import Observation
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
@@ -44,6 +45,15 @@ class Stop(NamedTuple):
     message: str = ""
     cause: BaseException | None = None
     """What the plant raised, or Ctrl-C; ``raise result.stop.cause`` goes on with it."""
+
+    @classmethod
+    def failed(cls, error: BaseException, final: Observation) -> Stop:
+        """What the plant raised, or the gate before it, or Ctrl-C."""
+        if isinstance(error, KeyboardInterrupt):
+            return cls(StopReason.STOPPED, final, "Ctrl-C", error)
+        refused = isinstance(error, CommandRefusedError)
+        reason = StopReason.COMMAND_REFUSED if refused else StopReason.PLANT_FAILED
+        return cls(reason, final, f"{type(error).__name__}: {error}", error)
 
 
 @dataclass(frozen=True)

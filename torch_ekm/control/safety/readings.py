@@ -10,7 +10,7 @@ import torch
 
 from ...plant import Observation, PlantStatus
 from ...typing import Array, Tensor
-from ..decision import Decision, Expectation, StopReason
+from ..decision import Expectation, StopReason
 from .fingertips import hold
 from .safety import Guards, Objection
 
@@ -45,20 +45,27 @@ class ReadingTests:
         doubt = self._age(seen) or self._range(seen)
         if before is None or doubt is not None:
             return doubt
-        ds, still = seen.state.minus(before.state).numpy(), torch.zeros_like(before.a)
-        return self._encoders(before, still, seen) or self._jump(ds, 0 * ds, seen)
+        if before.dated and seen.time < before.time:
+            message = f"the clock went back from {before.time:.3f} to {seen.time:.3f} s: check the driver"
+            return Objection(StopReason.STALE_SENSOR, message)
+        ds, still = seen.state.minus(before.state).numpy(), 0 * seen.a
+        return self._encoders(before, still, seen, self.guards.unchanged) or self._jump(ds, 0 * ds, seen)
 
     def after_motion(
         self,
         before: Observation,
-        decision: Decision,
+        sent: Tensor,
         seen: Observation,
         expected: Expectation | None,
         blind: int,
     ) -> Objection | None:
-        """Of a reading after a motion, the worst first; ``blind`` motions without a pose came before."""
-        doubt = self._age(seen, before) or self._range(seen) or self._encoders(before, decision.delta_a, seen)
-        doubt = self._speed(before, seen) if doubt is None else doubt
+        """Of a reading after the motors were sent by ``sent`` [rad], the worst first; ``blind`` motions
+        without a pose came before."""
+        doubt = self._age(seen, before)
+        if doubt is None or doubt.blind:  # the camera alone: the rest is still looked at
+            doubt = (
+                self._range(seen) or self._encoders(before, sent, seen) or self._speed(before, seen) or doubt
+            )
         if expected is None or (doubt is not None and not doubt.blind):
             return doubt
         ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
@@ -127,15 +134,17 @@ class ReadingTests:
                 return Objection(StopReason.OUT_OF_RANGE, message)
         return None
 
-    def _encoders(self, before: Observation, command: Tensor, seen: Observation) -> Objection | None:
-        """An encoder that went further than it was commanded to, or back."""
-        moved, v = (seen.a - before.a).numpy(), command.numpy()
+    def _encoders(
+        self, before: Observation, sent: Tensor, seen: Observation, limit: float | None = None
+    ) -> Objection | None:
+        """An encoder that went further than it was sent, or back."""
+        moved, v, limit = (seen.a - before.a).numpy(), sent.numpy(), limit or self.guards.encoder_jump
         away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))
         i, names = int(away.argmax()), self.hand.actuator_names
-        if away[i] > self.guards.encoder_jump:
+        if away[i] > limit:
             message = (
                 f"encoder '{names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
-                f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): check its cable and zero"
+                f"({deg(limit)} more are allowed, Guards.encoder_jump): check its cable and zero"
             )
             return Objection(StopReason.ENCODER_JUMP, message)
         return None

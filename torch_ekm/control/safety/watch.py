@@ -14,7 +14,7 @@ from ...exceptions import GraspError
 from ...plant import Observation, PlantStatus
 from ...typing import Array, Tensor
 from ..decision import Decision, Expectation, StopReason
-from .fingertips import FingertipWatch
+from .fingertips import Fingertips, FingertipWatch
 from .grip import GripWatch
 from .readings import ReadingTests, agree, deg
 from .safety import Guards, Objection
@@ -92,41 +92,23 @@ class Watch:
         return Verdict(seen, doubt is None, doubt)
 
     def command(self, decision: Decision, seen: Observation) -> Objection | None:
-        """Why a motion is refused before it is made; None: it is not."""
-        size = decision.delta_a.abs()
-        i = int(size.argmax())
-        if size[i] <= self.guards.increment:
-            return self.fingertips.before(decision, seen)
-        message = (
-            f"a command of {deg(size[i])} to actuator '{self.hand.actuator_names[i]}', Guards.increment is "
-            f"{deg(self.guards.increment)}: correct the controller, or raise the limit"
-        )
-        return Objection(StopReason.COMMAND_CEILING, message)
+        """Why a motion is refused before it is made; None: it is not. Its size is the gate's concern."""
+        return self.fingertips.before(decision, seen)
 
     def motion(
         self,
         before: Observation,
         decision: Decision,
+        sent: Tensor,
         after: Observation,
         look: Callable[[], Observation],
-        stuck: Tensor,
     ) -> Verdict:
-        """Judge a motion; where its reading is in doubt, ``look`` gives another.
-
-        Args:
-            stuck: which actuators the servo model calls so.
-        """
+        """Judge a motion of the motors by ``sent`` [rad]; where its reading is in doubt, ``look`` gives
+        another."""
         self.slid = ""
-        seen, last, doubt, expected = after, None, None, None
-        for left in range(self.guards.looks, -1, -1):
-            if seen.status is PlantStatus.LOST:
-                return Verdict(seen, False)
-            if decision.linearization is not None and (last is None or not torch.equal(seen.a, last.a)):
-                expected = self._expect(decision.linearization, seen.a - before.a)
-            doubt = self.readings.after_motion(before, decision, seen, expected, self.blind)
-            if left == 0 or (doubt is None and not self.fingertips.high(seen)):
-                break
-            last, seen = seen, _with_events(look(), seen)
+        seen, last, doubt, expected = self._look(before, decision, sent, after, look)
+        if seen.status is PlantStatus.LOST:
+            return Verdict(seen, False)
         if doubt is not None and not (doubt.blind or doubt.gated):
             if doubt.reason is StopReason.POSE_JUMP:
                 self.slid = self._slid(decision, before, expected, last, seen)
@@ -136,11 +118,42 @@ class Watch:
         if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
             doubt = doubt._replace(blind=True)
         tips = self.fingertips.judge(before, decision, seen)
-        halt = self._stuck(before, decision, seen, stuck) or tips.halt
         self.readings.follow(before, seen)
         if tips.force is not seen.fingertip_force:
             seen = dataclasses.replace(seen, fingertip_force=tips.force)
-        measured = self.blind == 0
+        return self._verdict(before, seen, doubt, expected, tips)
+
+    def _look(
+        self,
+        before: Observation,
+        decision: Decision,
+        sent: Tensor,
+        seen: Observation,
+        look: Callable[[], Observation],
+    ) -> tuple[Observation, Observation | None, Objection | None, Expectation | None]:
+        """The reading to be judged, the look before it, what speaks against it, and what was expected."""
+        last, expected = None, None
+        for left in range(self.guards.looks, -1, -1):
+            if seen.status is PlantStatus.LOST:
+                break
+            if decision.linearization is not None and (last is None or not torch.equal(seen.a, last.a)):
+                expected = self._expect(decision.linearization, seen.a - before.a)
+            doubt = self.readings.after_motion(before, sent, seen, expected, self.blind)
+            if left == 0 or (doubt is None and not self.fingertips.high(seen)):
+                return seen, last, doubt, expected
+            last, seen = seen, _with_events(look(), seen)
+        return seen, last, None, expected
+
+    def _verdict(
+        self,
+        before: Observation,
+        seen: Observation,
+        doubt: Objection | None,
+        expected: Expectation | None,
+        tips: Fingertips,
+    ) -> Verdict:
+        """Of a reading with which the loop goes on, unless fingertips or too many blind motions end it."""
+        measured, halt = self.blind == 0, tips.halt
         if doubt is not None and doubt.blind:
             self.blind += 1
             seen, most = self._predicted(before, expected, seen), self.guards.blind_motions
@@ -234,10 +247,14 @@ class Watch:
         doubtful = seen.status is PlantStatus.NOT_SEEN or self.readings.at_rest(seen, before) is not None
         return before if doubtful else seen
 
-    def _stuck(
+    def stuck(
         self, before: Observation, decision: Decision, seen: Observation, stuck: Tensor
     ) -> Objection | None:
-        """Actuators that do not move, however they are commanded."""
+        """Actuators that do not move, however they are commanded.
+
+        Args:
+            stuck: which the servo model calls so.
+        """
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
         again = still & (size > self.guards.stuck_command)
         self._still = torch.where(again, self._still + 1, 0 * self._still)
