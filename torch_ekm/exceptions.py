@@ -15,9 +15,9 @@ __all__ = [
     "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspEndsError", "GraspError",
     "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
     "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError",
-    "ParameterError", "PenetrationError", "PlantInUseError", "ShapeError", "SingularGraspError",
-    "SolverError", "SpeedWarning", "StaleReadingError", "StateMismatchError", "UnknownNameError",
-    "UnstableGraspError", "WorkerDiedError",
+    "ParameterError", "PenetrationError", "PlantInUseError", "ResumeError", "ShapeError",
+    "SingularGraspError", "SolverError", "SpeedWarning", "StaleReadingError", "StateMismatchError",
+    "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
 ]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message
@@ -281,6 +281,19 @@ class OutputError(EKMError):
     def __init__(self, path: object, problem: object) -> None:
         self.path, self.problem = str(path), str(problem)
         super().__init__(f"{path} cannot be written: {problem}; name a folder that can be written to")
+
+
+class ResumeError(EKMError):
+    """A turn that was cut short cannot be gone on with; the hand holds.
+
+    Attributes:
+        path: of the journal.
+        problem: why not.
+    """
+
+    def __init__(self, path: object, problem: str) -> None:
+        self.path, self.problem = str(path), problem
+        super().__init__(f"{path}: {problem}")
 
 
 class FolderInUseError(EKMError):

@@ -24,6 +24,7 @@ from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
+from .learned import Learned
 from .manipulation import Manipulation, Step, Stop
 from .pace import SLIDES, ForceSurprise
 from .reach import Reach, Reachability, follow_to_the_end, out_of_reach, reachability
@@ -90,6 +91,7 @@ class ClosedLoop:
         guards = self.safety.guards
         self._gate = Gate(plant, hand, increment=guards.increment, speed=guards.speed)
         self.plant, self.knowledge = ServoInverse(self._gate, hand, knowledge.servo), knowledge
+        self.learned = Learned(knowledge, controller)
         self._stop, self._rehearses = threading.Event(), False
         require("qpsolvers")  # now, not within the first motion; so with the learner's loops
         if learn and controller.enhanced is not None:
@@ -158,20 +160,18 @@ class ClosedLoop:
             EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises before there is a
                 reading.
         """
-        steps, motions = [], self.steps(target)
-        while True:
-            try:
-                steps.append(next(motions))
-            except StopIteration as end:
-                return Manipulation(target, self.controller.focus, tuple(steps), end.value)
+        return Manipulation.of(target, self.controller.focus, self.steps(target))
 
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         """The motions one by one; the generator's return value is the :class:`Stop`."""
         with self._gate.owned():
             self._stop.clear()
             self._gate.last = self._gate.failure = None
+            known = self.learned.state()
             try:
                 stop = yield from self._motions(target)
+                if stop.reason is StopReason.ENCODER_DRIFT:  # it drifted before it was found
+                    self.learned.restore(known)
                 if self.learn and self.controller.pace.adapts:
                     reached = stop.reason is StopReason.REACHED
                     self.knowledge.pace.fill_(self.controller.pace.factor * reached)
@@ -217,7 +217,7 @@ class ClosedLoop:
                 elif over.reason is StopReason.STALLED:
                     over = over._replace(message=progress.hindrances(seen, decision, model))
                     seen = yield from self._return_to_best(seen, decision, progress, watch)
-                return Stop(over.reason, seen, over.message)
+                return Stop(over.reason, seen, "; ".join(filter(None, (over.message, watch.lie))))
             seen, decision, sign, seconds = self._decide(seen, progress, watch)
             if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
                 progress.alarms += 1
@@ -329,7 +329,8 @@ class ClosedLoop:
         if progress.halt is not None or after.status is PlantStatus.LOST:  # nobody learns from this reading
             seconds += time.perf_counter() - began
             return Step(seen, decision, after, increment, moved, None, seconds, verdict.note)
-        self.plant.learn(after)
+        if verdict.encoders:
+            self.plant.learn(after)
         progress.halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
         report, lin, expected = None, decision.linearization, verdict.expected
         if lin is not None and expected is not None and after.status is PlantStatus.HELD:

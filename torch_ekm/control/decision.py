@@ -40,6 +40,7 @@ class StopReason(Enum):
     """This and what follows: see :class:`~torch_ekm.control.Guards`."""
     BLIND = "object not seen"
     ENCODER_JUMP = "encoder jump"
+    ENCODER_DRIFT = "encoder drift"
     JOINT_JUMP = "joint jump"
     POSE_JUMP = "pose jump"
     OUT_OF_RANGE = "reading out of range"

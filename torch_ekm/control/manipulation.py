@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -68,6 +69,16 @@ class Manipulation:
     def __repr__(self) -> str:
         message = f": {self.stop.message}" if self.stop.message else ""
         return f"<Manipulation: {self.reason.value} after {len(self.steps)} motions{message}>"
+
+    @classmethod
+    def of(cls, target: PoseTarget, focus: FocusedPose, motions: Generator[Step, None, Stop]) -> Manipulation:
+        """All motions, one after the other, to their end."""
+        steps = []
+        while True:
+            try:
+                steps.append(next(motions))
+            except StopIteration as end:
+                return cls(target, focus, tuple(steps), end.value)
 
     @property
     def errors(self) -> list[float]:

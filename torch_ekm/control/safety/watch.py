@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Callable
@@ -10,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from ...exceptions import GraspError
 from ...plant import Observation, PlantStatus
-from ...typing import Array, Tensor
+from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
+from .consistency import Consistency
 from .fingertips import Fingertips, FingertipWatch
 from .grip import GripWatch
 from .readings import ReadingTests, agree, deg
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
-_STRETCH = 12 * _DEG  # tendons stretch by less
-_ARMS = 0.35  # and moment arms that are not as described change it by this share of the way
 _UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
 _ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
@@ -43,6 +40,8 @@ class Verdict(NamedTuple):
     """What a guard objects to where the loop goes on."""
     expected: Expectation | None = None
     """What f + g predict of what the encoders did; None: the model has no step."""
+    encoders: bool = True
+    """The servos may be learned from them."""
 
 
 class Watch:
@@ -64,6 +63,7 @@ class Watch:
     ) -> None:
         self.guards, self.hand, self._expect = guards, model.hand, expect
         self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
+        self.consistency = Consistency(self.readings, model)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0
@@ -71,9 +71,10 @@ class Watch:
         self.grip = GripWatch(model)
         self.slid = ""
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
+        self.lie = ""
+        """What the first motion that did not teach says of a sensor that goes on, for the end; or empty."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
         self._tolerance, self._away = tolerance, 0
-        self._begun: Observation | None = None
         self._undated = ""
         """That readings have no date, until it is said."""
 
@@ -86,7 +87,7 @@ class Watch:
                 break
             seen = look()
         self.readings.follow(None, seen)
-        self._begun = seen
+        self.consistency.begin(seen)
         self._undated = "" if seen.dated else _UNDATED
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return Verdict(seen, doubt is None, doubt)
@@ -121,7 +122,16 @@ class Watch:
         self.readings.follow(before, seen)
         if tips.force is not seen.fingertip_force:
             seen = dataclasses.replace(seen, fingertip_force=tips.force)
-        return self._verdict(before, seen, doubt, expected, tips)
+        verdict = self._verdict(before, seen, doubt, expected, tips)
+        if (doubt is not None and doubt.blind) or self.slid:
+            return verdict
+        odd, halt = self.consistency.motion(before, sent, seen, expected)
+        if odd is None:
+            self.lie = self.lie or ("" if tips.true else tips.note)
+            return verdict if tips.true else verdict._replace(teaches=False)
+        note = "; ".join(filter(None, (verdict.note, odd.message)))
+        halt = verdict.halt or halt
+        return verdict._replace(teaches=False, halt=halt, note=note, encoders=not odd.encoders)
 
     def _look(
         self,
@@ -208,32 +218,7 @@ class Watch:
 
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
-        hand, found = self.hand, ""
-        off, way = self._stretch(seen), seen.a.numpy() - hand.actuator_offset
-        if self._begun is not None and not torch.equal(self._begun.a, seen.a):  # since the beginning
-            off, way = off - self._stretch(self._begun), (seen.a - self._begun.a).numpy()
-        most = _STRETCH + _ARMS * abs(way)
-        i = int((abs(off) - most).argmax())
-        if abs(off[i]) > most[i]:
-            joints = zip(hand.joint_names, hand.actuation_jacobian[i], strict=True)
-            names = ", ".join(name for name, arm in joints if arm)
-            found = f"; encoder '{hand.actuator_names[i]}' and its joints ({names}) differ by {deg(off[i])}"
-        force = seen.fingertip_force
-        with contextlib.suppress(GraspError):
-            touching = self.fingertips.model.touching(seen.state).finger
-            pressed = (
-                [] if force is None else [pad.name for pad, f in zip(hand.pads, force, strict=True) if f > 1]
-            )
-            away = ", ".join(name for name in pressed if name not in touching)
-            if away:
-                found += f"; fingertips press ({away}) where pose and joints have them off the object"
-        return found and f"{found}: check these sensors, and the pose"
-
-    def _stretch(self, seen: Observation) -> Array:
-        """``a - a_0 - J_a q`` [rad]."""
-        hand = self.hand
-        stretch: Array = seen.a.numpy() - hand.actuator_offset - hand.actuation_jacobian @ seen.q.numpy()
-        return stretch
+        return self.consistency.suspects(seen) + (f"; {self.lie}" if self.lie else "")
 
     def forget(self) -> None:
         """Signs of a loss are heeded: the hand goes back."""
