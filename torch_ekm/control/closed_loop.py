@@ -167,11 +167,13 @@ class ClosedLoop:
         with self._gate.owned():
             self._stop.clear()
             self._gate.last = self._gate.failure = None
-            known = self.learned.state()
+            known, guards = self.learned.state(), self.safety.guards
             try:
-                stop = yield from self._motions(target)
-                if stop.reason is StopReason.ENCODER_DRIFT:  # it drifted before it was found
+                watch = Watch(guards, self.controller.kinematic, self._expect, self.safety.rule.tolerance)
+                stop = yield from self._motions(target, watch)
+                if watch.lie:
                     self.learned.restore(known)
+                    stop = stop.told(watch.lie)
                 if self.learn and self.controller.pace.adapts:
                     reached = stop.reason is StopReason.REACHED
                     self.knowledge.pace.fill_(self.controller.pace.factor * reached)
@@ -186,9 +188,8 @@ class ClosedLoop:
                 self.hold()
                 raise
 
-    def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
+    def _motions(self, target: PoseTarget, watch: Watch) -> Generator[Step, None, Stop]:
         model = self.controller.kinematic
-        watch = Watch(self.safety.guards, model, self._expect, self.safety.rule.tolerance)
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
@@ -217,7 +218,7 @@ class ClosedLoop:
                 elif over.reason is StopReason.STALLED:
                     over = over._replace(message=progress.hindrances(seen, decision, model))
                     seen = yield from self._return_to_best(seen, decision, progress, watch)
-                return Stop(over.reason, seen, "; ".join(filter(None, (over.message, watch.lie))))
+                return Stop(over.reason, seen, over.message)
             seen, decision, sign, seconds = self._decide(seen, progress, watch)
             if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
                 progress.alarms += 1

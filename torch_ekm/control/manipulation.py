@@ -47,6 +47,12 @@ class Stop(NamedTuple):
     cause: BaseException | None = None
     """What the plant raised, or Ctrl-C; ``raise result.stop.cause`` goes on with it."""
 
+    def told(self, more: str) -> Stop:
+        """With one more thing to say, unless it is said already."""
+        if more in self.message:
+            return self
+        return self._replace(message="; ".join(filter(None, (self.message, more))))
+
     @classmethod
     def failed(cls, error: BaseException, final: Observation) -> Stop:
         """What the plant raised, or the gate before it, or Ctrl-C."""

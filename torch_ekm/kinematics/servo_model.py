@@ -161,6 +161,7 @@ class ServoModel(Recorded, nn.Module):
         error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
         self._open(at, error**2 > 16 * noise * spread, went)
+        error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
         at.estimate[went] += Px * (error / spread)[:, None]
         P = at.covariance[went] - Px[..., None] * Px[:, None, :] / spread[:, None, None]
@@ -194,6 +195,7 @@ class ServoModel(Recorded, nn.Module):
     def _open(self, at: SimpleNamespace, surprising: Mask, which: Mask) -> None:
         """The second surprise in succession: it is another servo, its old estimate is no evidence."""
         again = surprising & (at.surprises[which] > 0)
+        at.estimate[which] = np.where(again[:, None], 0.0, at.estimate[which])
         at.covariance[which] = np.where(again[:, None, None], self._prior.numpy(), at.covariance[which])
         at.surprises[which] = surprising & ~again
 

@@ -23,8 +23,9 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _NOWHERE = 0.5 * _DEG  # an encoder moves less in a motion in which its motor is sent nowhere
 # e = alpha w + beta + noise of what the joints leave of an encoder's motion w: beta is its drift
-_ARM_STD, _DRIFT_STD, _REST_STD = 0.3, 2.0 * _DEG, 0.4 * _DEG  # of alpha, beta; noise at least
-_DRIFTS, _SURE = 0.4 * _DEG, 4.0  # [rad] a motion, and standard deviations, from which it is called one
+_ARM_STD, _DRIFT_STD, _REST_STD = 0.3, 2.0 * _DEG, 0.4 * _DEG  # of alpha, beta; noise, a first guess
+_GUESS, _FEWEST = 4, 6  # that is worth so many motions; and with fewer nothing is said
+_DRIFTS, _SURE = 0.4 * _DEG, 5.0  # [rad] a motion, and standard deviations, from which it is called one
 _AGAINST = -0.3  # share of a predicted motion that is none of it; healthy hands make .4 of it and more
 _SHARP = 4.0  # standard deviations of a motion that is large enough to be judged
 _STRETCH = 12 * _DEG  # tendons stretch by less
@@ -76,8 +77,7 @@ class Consistency:
             if self._running[name]:
                 found = test
             if self._running[name] >= test.ends:
-                message = f"{test.message} ({self._running[name]} motions running)"
-                halt = Objection(test.reason, message)
+                halt = Objection(test.reason, f"{test.message} (motions running: {self._running[name]})")
         return found, halt
 
     def _tests(
@@ -127,8 +127,10 @@ class Consistency:
             alpha, beta = (b * we - w * e) / det, (a * e - w * we) / det
             left = ee - 2 * alpha * we - 2 * beta * e + alpha**2 * ww + 2 * alpha * beta * w + beta**2 * n
             std = np.sqrt(variance * a / det)
-            variance = np.maximum(_REST_STD**2, left / np.maximum(n - 2, 1))
-        judged = (n > 3) & (ww > n * _DRIFTS**2)  # joints may be bent by other motors where this one stands
+            variance = (_GUESS * _REST_STD**2 + left) / (_GUESS + np.maximum(n - 2, 0))
+        judged = (n >= _FEWEST) & (
+            ww > n * _DRIFTS**2
+        )  # joints may be bent by other motors where this one stands
         return beta, np.where(judged, beta / std, 0.0)
 
     def suspects(self, seen: Observation) -> str:

@@ -72,7 +72,7 @@ class Watch:
         self.slid = ""
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
         self.lie = ""
-        """What the first motion that did not teach says of a sensor that goes on, for the end; or empty."""
+        """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
         self._tolerance, self._away = tolerance, 0
         self._undated = ""
@@ -129,6 +129,8 @@ class Watch:
         if odd is None:
             self.lie = self.lie or ("" if tips.true else tips.note)
             return verdict if tips.true else verdict._replace(teaches=False)
+        if odd.encoders:
+            self.lie = odd.message
         note = "; ".join(filter(None, (verdict.note, odd.message)))
         halt = verdict.halt or halt
         return verdict._replace(teaches=False, halt=halt, note=note, encoders=not odd.encoders)
@@ -218,7 +220,7 @@ class Watch:
 
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
-        return self.consistency.suspects(seen) + (f"; {self.lie}" if self.lie else "")
+        return self.consistency.suspects(seen)
 
     def forget(self) -> None:
         """Signs of a loss are heeded: the hand goes back."""
