@@ -173,13 +173,13 @@ class WatchedLoop(ClosedLoop):
     """A loop that counts motions whose refused readings have changed what is known."""
 
     refused: dict[int, torch.Tensor]
-    learned = 0
+    misled = 0
 
     def _move(self, seen, decision, *args, **options):
         before = self._known()
         step = super()._move(seen, decision, *args, **options)
         taught = step.report is not None or any(map(differs, before, self._known()))
-        self.learned += taught and not self.refused.keys().isdisjoint((id(seen.q), id(step.after.q)))
+        self.misled += taught and not self.refused.keys().isdisjoint((id(seen.q), id(step.after.q)))
         return step
 
     def _known(self) -> list[torch.Tensor]:
@@ -257,7 +257,7 @@ def session(held, seed: int, readings: int, learns: bool, count: Count, refused:
             reason = type(error).__name__
         refused.clear()
         count.reasons[reason] += 1
-        count.learned += loop.learned
+        count.learned += loop.misled
         passed += len(plant.last)
         sizes = [float(v.abs().max()) for v in plant.given]
         largest = max((size for size in sizes if math.isfinite(size)), default=0.0)

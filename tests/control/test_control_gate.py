@@ -273,15 +273,12 @@ def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str)
     assert error_of_a_clean_turn(held, ekm, knowledge) < 1.1 * before
 
 
-@pytest.mark.parametrize("learns", [True, False])
-def test_an_encoder_of_a_motor_at_work_that_drifts_is_found_and_what_it_taught_is_taken_back(
-    held, learns: bool
-) -> None:
+def test_an_encoder_of_a_motor_at_work_that_drifts_is_found_and_what_it_taught_is_taken_back(held) -> None:
     """Its joints do not show what it shows; moment arms that are not as described look alike for a while."""
     fault = changed(a=lambda k, a: a + k * DEG * third(a))
     plant, knowledge = Obedient(held[2], held[0], fault, since=0), HandKnowledge.of(held[2].hand)
     known = {name: value.clone() for name, value in knowledge.state_dict().items()}
-    _, done = turn(held, plant, learns=learns, knowledge=knowledge)
+    _, done = turn(held, plant, knowledge=knowledge)
     assert done.reason is Reason.ENCODER_DRIFT
     assert re.search("encoder 'thumb_distal' went 0[.][67][0-9]* deg more than its joints", done.stop.message)
     assert len(done.steps) <= 12

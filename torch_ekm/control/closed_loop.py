@@ -169,7 +169,8 @@ class ClosedLoop:
             self._gate.last = self._gate.failure = None
             known, guards = self.learned.state(), self.safety.guards
             try:
-                watch = Watch(guards, self.controller.kinematic, self._expect, self.safety.rule.tolerance)
+                model, servo, rule = self.controller.kinematic, self.knowledge.servo, self.safety.rule
+                watch = Watch(guards, model, self._expect, rule.tolerance, servo)
                 stop = yield from self._motions(target, watch)
                 if watch.lie:
                     self.learned.restore(known)

@@ -37,6 +37,11 @@ class IdealServos(Recorded, nn.Module):
         self.names = tuple(names)
         self.stuck = nn.Buffer(torch.zeros(len(self.names)).bool())
 
+    @property
+    def bias(self) -> Float[Tensor, " n_a"]:
+        """0 [rad]."""
+        return torch.zeros(len(self.names), dtype=torch.float64)
+
     def command(self, wanted: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """v = w: the increments that are wanted, unchanged [rad]."""
         return wanted

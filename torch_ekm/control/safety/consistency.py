@@ -11,6 +11,8 @@ import numpy as np
 import torch
 
 from ...exceptions import GraspError
+from ...kinematics import ServoModel
+from ...kinematics.servo_model import IdealServos
 from ...plant import Observation
 from ...typing import Array, Tensor
 from ..decision import Expectation, StopReason
@@ -25,7 +27,8 @@ _NOWHERE = 0.5 * _DEG  # an encoder moves less in a motion in which its motor is
 # e = alpha w + beta + noise of what the joints leave of an encoder's motion w: beta is its drift
 _ARM_STD, _DRIFT_STD, _REST_STD = 0.3, 2.0 * _DEG, 0.4 * _DEG  # of alpha, beta; noise, a first guess
 _GUESS, _FEWEST = 4, 6  # that is worth so many motions; and with fewer nothing is said
-_DRIFTS, _SURE = 0.4 * _DEG, 5.0  # [rad] a motion, and standard deviations, from which it is called one
+_DRIFTS, _SURE = 0.4 * _DEG, 6.0  # [rad] a motion, and standard deviations, from which it is called one
+_BIAS, _BOTH = 0.6 * _DEG, 1.5  # a servo's bias of this size that says the same makes it as much surer
 _AGAINST = -0.3  # share of a predicted motion that is none of it; healthy hands make .4 of it and more
 _SHARP = 4.0  # standard deviations of a motion that is large enough to be judged
 _STRETCH = 12 * _DEG  # tendons stretch by less
@@ -55,10 +58,13 @@ class Consistency:
     Args:
         readings: tests and limits of single readings.
         model: f, with the hand.
+        servo: what is known of the servos.
     """
 
-    def __init__(self, readings: ReadingTests, model: KinematicModel) -> None:
-        self.readings, self.hand, self.model = readings, model.hand, model
+    def __init__(
+        self, readings: ReadingTests, model: KinematicModel, servo: ServoModel | IdealServos
+    ) -> None:
+        self.readings, self.hand, self.model, self.servo = readings, model.hand, model, servo
         self._running: Counter[str] = Counter()
         self._begun: Observation | None = None
         self._sums = np.zeros((6, model.hand.n_a))  # n, w, w^2, e, w e, e^2 of each actuator
@@ -107,7 +113,7 @@ class Consistency:
             tests["driven"] = Test(
                 float(abs(sure[i]) * (abs(rate[i]) > _DRIFTS)), _SURE, 1, StopReason.ENCODER_DRIFT,
                 f"encoder '{self.hand.actuator_names[i]}' went {deg(rate[i])} more than its joints in each "
-                f"motion, whichever way ({abs(sure[i]):.1f} standard deviations, limit {_SURE:g}): it "
+                f"motion, whichever way ({abs(sure[i]):.1f} standard deviations, those of its servo counted, limit {_SURE:g}): it "
                 "drifts, or slips; check its magnet and cable",
                 True,
             )  # fmt: skip
@@ -131,7 +137,9 @@ class Consistency:
         judged = (n >= _FEWEST) & (
             ww > n * _DRIFTS**2
         )  # joints may be bent by other motors where this one stands
-        return beta, np.where(judged, beta / std, 0.0)
+        bias = self.servo.bias.numpy()
+        surer = np.where((abs(bias) > _BIAS) & (bias * beta > 0), _BOTH, 1.0)
+        return beta, np.where(judged, surer * beta / std, 0.0)
 
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""

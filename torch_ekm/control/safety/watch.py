@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
+from ...kinematics import ServoModel
+from ...kinematics.servo_model import IdealServos
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
@@ -52,6 +54,7 @@ class Watch:
         model: f, with the hand.
         expect: f + g of what the encoders did, from where the model was linearized.
         tolerance: of the target [rad]; errors that grow by more are no noise.
+        servo: what is known of the servos; None: they are ideal.
     """
 
     def __init__(
@@ -60,10 +63,12 @@ class Watch:
         model: KinematicModel,
         expect: Callable[[Linearization, Tensor], Expectation],
         tolerance: float = math.inf,
+        servo: ServoModel | IdealServos | None = None,
     ) -> None:
         self.guards, self.hand, self._expect = guards, model.hand, expect
         self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
-        self.consistency = Consistency(self.readings, model)
+        servo = IdealServos(model.hand.actuator_names) if servo is None else servo
+        self.consistency = Consistency(self.readings, model, servo)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0
