@@ -88,7 +88,7 @@ class Journal:
         against = self._against(loop, known, here)
         if against:
             raise ResumeError(self.path, against)
-        loop.learned.restore(known["learned"])
+        loop.learned.load(known["learned"])
         target = PoseTarget(known["target"]["position"], known["target"]["rotation"])
         return Manipulation.of(target, loop.controller.focus, self.steps(loop, target))
 

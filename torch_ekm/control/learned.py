@@ -36,11 +36,22 @@ class Learned:
         return found
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Know what was known when :meth:`state` was asked.
+        """Know what was known when :meth:`state` was asked of this."""
+        for name, part in self._parts.items():
+            if name in state:  # not the part's own method: a change that is not yet is no count below 0
+                nn.Module.load_state_dict(part, state[name])
+
+    def load(self, state: Mapping[str, Any]) -> None:
+        """Know what another one knew; all or nothing.
 
         Raises:
             StateMismatchError: it is that of other parts.
         """
-        for name, part in self._parts.items():
-            if name in state:
-                part.load_state_dict(state[name])
+        before = self.state()
+        try:
+            for name, part in self._parts.items():
+                if name in state:
+                    part.load_state_dict(state[name])
+        except Exception:
+            self.restore(before)
+            raise

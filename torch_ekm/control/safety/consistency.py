@@ -20,7 +20,7 @@ from .readings import ReadingTests, deg
 from .safety import Objection
 
 if TYPE_CHECKING:
-    from ...model import KinematicModel
+    from ...model import KinematicModel, Linearization
 
 _DEG = math.pi / 180
 _NOWHERE = 0.5 * _DEG  # an encoder moves less in a motion in which its motor is sent nowhere
@@ -74,11 +74,16 @@ class Consistency:
         self._begun = seen
 
     def motion(
-        self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation | None
+        self,
+        before: Observation,
+        sent: Tensor,
+        seen: Observation,
+        expected: Expectation | None,
+        lin: Linearization | None,
     ) -> tuple[Test | None, Objection | None]:
         """The row that objects to a motion, if any; and why the manipulation ends by it, if it does."""
         found, halt = None, None
-        for name, test in self._tests(before, sent, seen, expected).items():
+        for name, test in self._tests(before, sent, seen, expected, lin).items():
             self._running[name] = self._running[name] + 1 if test.figure > test.limit else 0
             if self._running[name]:
                 found = test
@@ -87,7 +92,12 @@ class Consistency:
         return found, halt
 
     def _tests(
-        self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation | None
+        self,
+        before: Observation,
+        sent: Tensor,
+        seen: Observation,
+        expected: Expectation | None,
+        lin: Linearization | None,
     ) -> dict[str, Test]:
         moved = (seen.a - before.a).where(sent == 0, 0.0)
         i = int(moved.abs().argmax())
@@ -99,7 +109,8 @@ class Consistency:
                 True,
             )
         }  # fmt: skip
-        if expected is not None:
+        if expected is not None and lin is not None:
+            described = lin.described_jacobian @ expected.moved
             share, sharp = self.readings.share(before, seen, expected.nominal)
             tests["sign"] = Test(
                 -share * (sharp >= _SHARP), -_AGAINST, 2, StopReason.WRONG_WAY,
@@ -108,22 +119,25 @@ class Consistency:
                 "'torch-ekm check --plant'",
                 False,
             )  # fmt: skip
-            rate, sure = self._drift(before, seen, expected)
+            rate, sure = self._drift(before, seen, expected.moved, described)
             i = int(abs(sure).argmax())
             tests["driven"] = Test(
                 float(abs(sure[i]) * (abs(rate[i]) > _DRIFTS)), _SURE, 1, StopReason.ENCODER_DRIFT,
                 f"encoder '{self.hand.actuator_names[i]}' went {deg(rate[i])} more than its joints in each "
-                f"motion, whichever way ({abs(sure[i]):.1f} standard deviations, those of its servo counted, limit {_SURE:g}): it "
-                "drifts, or slips; check its magnet and cable",
+                f"motion, whichever way ({abs(sure[i]):.1f} standard deviations, more where its servo "
+                f"agrees, limit {_SURE:g}): it drifts, or slips; check its magnet and cable",
                 True,
             )  # fmt: skip
         return tests
 
-    def _drift(self, before: Observation, seen: Observation, expected: Expectation) -> tuple[Array, Array]:
-        """beta of each actuator [rad], and its size in standard deviations, by Bayesian least squares."""
-        n_q, J_a = self.hand.n_q, self.hand.actuation_jacobian
-        w = expected.moved.numpy()
-        e = J_a @ (expected.nominal - seen.state.minus(before.state)).numpy()[:n_q]
+    def _drift(
+        self, before: Observation, seen: Observation, moved: Tensor, described: Tensor
+    ) -> tuple[Array, Array]:
+        """beta of each actuator [rad], and its size in standard deviations, by Bayesian least squares on what
+        the hand as described predicts: what is learned of it changes meanwhile."""
+        n_q, w = self.hand.n_q, moved.numpy()
+        came = seen.state.minus(before.state)
+        e = self.hand.actuation_jacobian @ (described - came).numpy()[:n_q]
         self._sums += np.stack([np.ones_like(w), w, w * w, e, w * e, e * e])
         n, w, ww, e, we, ee = self._sums
         beta, std, variance = 0 * n, 0 * n, np.full_like(n, _REST_STD**2)

@@ -130,7 +130,7 @@ class Watch:
         verdict = self._verdict(before, seen, doubt, expected, tips)
         if (doubt is not None and doubt.blind) or self.slid:
             return verdict
-        odd, halt = self.consistency.motion(before, sent, seen, expected)
+        odd, halt = self.consistency.motion(before, sent, seen, expected, decision.linearization)
         if odd is None:
             self.lie = self.lie or ("" if tips.true else tips.note)
             return verdict if tips.true else verdict._replace(teaches=False)
