@@ -285,25 +285,20 @@ class Hardware(Obedient):
     """A hand that stands where it stood, whatever happens to the process that drives it."""
 
     def __init__(self, model: KinematicModel, seen: Observation, folder: Path) -> None:
-        super().__init__(model, seen, takes=0.0)
         self._file = folder / "hand.pt"
         if self._file.exists():
-            q, a, position, rotation, force = torch.load(self._file)
-            self.state, self.a, self.force = (
-                replace(seen, q=q, position=position, rotation=rotation).state,
-                a,
-                force,
-            )
+            *known, seconds = torch.load(self._file)
+            q, a, position, rotation, force = known
+            seen = replace(seen, q=q, a=a, position=position, rotation=rotation, fingertip_force=force)
+            seen = replace(seen, time=seconds)
+        super().__init__(model, seen)
 
     def command(self, delta_a: torch.Tensor) -> Observation:
         seen = super().command(delta_a)
         state, part = self.state, self._file.with_suffix(".part")
-        torch.save([state.q, self.a, state.position, state.rotation, self.force], part)
+        torch.save([state.q, self.a, state.position, state.rotation, self.force, seen.time], part)
         part.replace(self._file)
-        return replace(seen, time=time.monotonic())
-
-    def observe(self) -> Observation:
-        return replace(super().observe(), time=time.monotonic())
+        return seen
 
 
 def killed(held, moment: float, learns: bool, folder: Path) -> tuple[int, str]:
