@@ -23,9 +23,9 @@ __all__ = [
     "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspEndsError", "GraspError",
     "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
     "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError",
-    "ParameterError", "PenetrationError", "ShapeError", "SingularGraspError", "SolverError", "SpeedWarning",
-    "StaleReadingError", "StateError", "StateMismatchError", "UnknownNameError", "UnstableGraspError",
-    "WorkerDiedError",
+    "ParameterError", "PenetrationError", "PlantInUseError", "ResumeError", "ShapeError",
+    "SingularGraspError", "SolverError", "SpeedWarning", "StaleReadingError", "StateError",
+    "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
 ]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message
@@ -298,6 +298,19 @@ class OutputError(EKMError):
         super().__init__(f"{path} cannot be written: {problem}; name a folder that can be written to")
 
 
+class ResumeError(EKMError):
+    """A turn that was cut short cannot be gone on with; the hand holds.
+
+    Attributes:
+        path: of the journal.
+        problem: why not.
+    """
+
+    def __init__(self, path: object, problem: str) -> None:
+        self.path, self.problem = str(path), problem
+        super().__init__(f"{path}: {problem}")
+
+
 class FolderInUseError(EKMError):
     """Another writer is at work in a folder that takes one at a time.
 
@@ -410,4 +423,32 @@ class NeverAtRestError(DeviceError):
 
 
 class CommandRefusedError(DeviceError):
-    """A command beyond the limits of the wiring; nothing was sent."""
+    """A command beyond the limits of the wiring, or of a :class:`~torch_ekm.plant.Gate`; nothing was sent.
+
+    Attributes:
+        by, asked, allowed: who asked for what, and what would have passed; empty where a driver refuses.
+    """
+
+    by = asked = allowed = ""
+
+    @classmethod
+    def by_gate(cls, device: object, by: str, asked: str, allowed: str) -> CommandRefusedError:
+        """What a gate says of a command."""
+        error = cls(device, f"{by} asked for {asked}; allowed are {allowed}; nothing was sent")
+        error.by, error.asked, error.allowed = by, asked, allowed
+        return error
+
+
+class PlantInUseError(EKMError):
+    """Somebody else commands this plant: one hand has one master.
+
+    Attributes:
+        plant: its kind.
+    """
+
+    def __init__(self, plant: str) -> None:
+        self.plant = plant
+        super().__init__(
+            f"this {plant} is commanded by another loop, or by this one in another thread; wait until that "
+            "has ended, or close its generator of steps"
+        )

@@ -270,7 +270,8 @@ FAULTS = {
     "too much force": (
         lambda plant, seen: seen, {"force_ceiling": 3.0}, Reason.FORCE_CEILING, "force_ceiling is 3 N"),
     "too fast": (lambda plant, seen: seen, {"speed": 0.01}, Reason.SPEED_CEILING, "driver must wait"),
-    "too far": (lambda plant, seen: seen, {"increment": 0.1 * DEG}, Reason.COMMAND_CEILING, "increment is"),
+    "too far": (
+        lambda plant, seen: seen, {"increment": 0.1 * DEG}, Reason.COMMAND_REFUSED, "allowed are up to"),
 }  # fmt: skip
 
 
@@ -343,17 +344,16 @@ def test_a_goal_that_nobody_saw_is_not_reached(held) -> None:
     assert run.reason is Reason.BLIND
 
 
-def test_servo_inverse_takes_back_its_last_motion(held) -> None:
+def test_servo_inverse_learns_of_a_motion_when_its_reading_is_accepted(held) -> None:
     seen, _, model = held
     plant = ServoInverse(Obedient(model, seen), model.hand)
     da = torch.full_like(seen.a, 0.02)
-    plant.command(da)
+    start = plant.command(da)
     before = {name: value.clone() for name, value in plant.servo.named_buffers()}
-    wrong = plant.command(da)
-    assert not same(dict(plant.servo.named_buffers()), before)
-    plant.correct(None)
+    after = plant.send(da, start, "turn")
+    plant.observe()
     assert same(dict(plant.servo.named_buffers()), before)
-    plant.correct(wrong)
+    plant.learn(after)
     assert not same(dict(plant.servo.named_buffers()), before)
 
 

@@ -18,7 +18,13 @@ DEG = math.pi / 180
 EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 REACH = 60 * DEG * np.ones(3)
 HAND = SimpleNamespace(
-    actuator_names=("thumb", "index", "middle"), actuator_lower=-REACH, actuator_upper=REACH
+    name="three",
+    actuator_names=("thumb", "index", "middle"),
+    actuator_lower=-REACH,
+    actuator_upper=REACH,
+    n_q=3,
+    n_a=3,
+    pads=range(3),
 )
 
 
@@ -118,8 +124,8 @@ def test_the_end_of_the_range_teaches_nothing() -> None:
     for w in moves(30):
         plant.command(w)
     known = plant.servo.estimate.clone()
-    up = torch.full((3,), 200 * DEG, dtype=torch.float64)
-    plant.command(up)
+    for _ in range(8):
+        plant.command(torch.full((3,), 15 * DEG, dtype=torch.float64))
     at_end = {k: v.clone() for k, v in plant.servo.state_dict().items()}
     for _ in range(10):
         plant.command(5 * DEG * torch.ones(3, dtype=torch.float64))

@@ -8,6 +8,7 @@ from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
 from .focus import Direction, FocusedPose, PoseTarget
 from .force_sensitivity import ForceSensitivity
+from .journal import Journal
 from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .manipulation import Manipulation, Step, Stop
@@ -40,6 +41,7 @@ __all__ = [
     "HandKnowledge",
     "Inequality",
     "JointLimit",
+    "Journal",
     "Limit",
     "LimitingFunction",
     "LinearizedModel",

@@ -16,7 +16,7 @@ from .._checks import check_kind
 from .._extras import require
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..model import Linearization
-from ..plant import Observation, Plant, PlantStatus, ServoInverse
+from ..plant import Gate, Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport
 from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
@@ -24,11 +24,11 @@ from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
+from .learned import Learned
 from .manipulation import Manipulation, Step, Stop
 from .pace import SLIDES, ForceSurprise
 from .reach import Reach, Reachability, follow_to_the_end, out_of_reach, reachability
 from .safety import Safety
-from .safety.checked_plant import CheckedPlant, PlantFailedError
 from .safety.progress import Progress
 from .safety.watch import Watch
 
@@ -49,7 +49,8 @@ class ClosedLoop:
     step is lost. Whatever ends it early, a ``break`` too, the hand is commanded to hold its position. At the
     end of a ``with`` block the plant is closed, after it holds if the block failed.
 
-    Commands go through a :class:`~torch_ekm.plant.ServoInverse`; the model learns from what the encoders did.
+    Commands go through a :class:`~torch_ekm.plant.ServoInverse` and a :class:`~torch_ekm.plant.Gate`, which
+    lets one loop at a time through; the model learns from what the encoders did.
 
     Args:
         plant: with a grasped object (already reset).
@@ -86,10 +87,12 @@ class ClosedLoop:
         controller.follow(knowledge.figures)
         controller.forces = None if controller.enhanced is None else knowledge.forces
         self._figures = DescribedFigures() if controller.enhanced is None else knowledge.figures
-        self._checked = CheckedPlant(plant, hand)
-        self.plant, self.knowledge = ServoInverse(self._checked, hand, knowledge.servo), knowledge
         self.controller, self.learn, self.decline = controller, learn, decline
         self.safety = Safety() if safety is None else safety
+        guards = self.safety.guards
+        self._gate = Gate(plant, hand, increment=guards.increment, speed=guards.speed)
+        self.plant, self.knowledge = ServoInverse(self._gate, hand, knowledge.servo), knowledge
+        self.learned = Learned(knowledge, controller)
         self._stop, self._rehearses = threading.Event(), False
         require("qpsolvers")  # now, not within the first motion; so with the learner's loops
         if learn and controller.enhanced is not None:
@@ -112,7 +115,7 @@ class ClosedLoop:
     def hold(self) -> None:
         """Command the hand to stay where it is; what the plant raises here is ignored."""
         with contextlib.suppress(Exception):
-            self.plant.command(torch.zeros(self.controller.kinematic.hand.n_a, dtype=torch.float64))
+            self._gate.command(torch.zeros(self.controller.kinematic.hand.n_a), by="hold")
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
         """``max |angle|`` of this loop on a :class:`ModelHand`: its programs, limits, pace and signs of a
@@ -154,43 +157,41 @@ class ClosedLoop:
         """Drive the object to ``target``.
 
         Raises:
+            PlantInUseError: another loop, or this one in another thread, commands the plant.
             EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises before there is a
                 reading.
         """
-        steps, motions = [], self.steps(target)
-        while True:
-            try:
-                steps.append(next(motions))
-            except StopIteration as end:
-                return Manipulation(target, self.controller.focus, tuple(steps), end.value)
+        return Manipulation.of(target, self.controller.focus, self.steps(target))
 
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
         """The motions one by one; the generator's return value is the :class:`Stop`."""
-        self._stop.clear()
-        self._checked.last = None
-        try:
-            stop = yield from self._motions(target)
-            if self.learn and self.controller.pace.adapts:
-                self.knowledge.pace.fill_(self.controller.pace.factor * (stop.reason is StopReason.REACHED))
-            return stop
-        except PlantFailedError as failed:
-            self.hold()
-            error, last = failed.cause, self._checked.last
-            if last is None:
-                raise error from None
-            return Stop(StopReason.PLANT_FAILED, last, f"{type(error).__name__}: {error}", error)
-        except KeyboardInterrupt as stopped:
-            self.hold()
-            if (last := self._checked.last) is None:
+        with self._gate.owned():
+            self._stop.clear()
+            self._gate.last = self._gate.failure = None
+            known, guards = self.learned.state(), self.safety.guards
+            try:
+                model, servo, rule = self.controller.kinematic, self.knowledge.servo, self.safety.rule
+                watch = Watch(guards, model, self._expect, rule.tolerance, servo)
+                stop = yield from self._motions(target, watch)
+                if watch.lie:
+                    self.learned.restore(known)
+                    stop = stop.told(watch.lie)
+                if self.learn and self.controller.pace.adapts:
+                    reached = stop.reason is StopReason.REACHED
+                    self.knowledge.pace.fill_(self.controller.pace.factor * reached)
+                return stop
+            except (Exception, KeyboardInterrupt) as error:
+                last, failure = self._gate.last, self._gate.failure
+                self.hold()
+                if last is None or not (error is failure or isinstance(error, KeyboardInterrupt)):
+                    raise
+                return Stop.failed(error, last)
+            except BaseException:  # a closed generator as well: the hand must not go on
+                self.hold()
                 raise
-            return Stop(StopReason.STOPPED, last, "Ctrl-C", stopped)
-        except BaseException:  # a closed generator as well: the hand must not go on
-            self.hold()
-            raise
 
-    def _motions(self, target: PoseTarget) -> Generator[Step, None, Stop]:
+    def _motions(self, target: PoseTarget, watch: Watch) -> Generator[Step, None, Stop]:
         model = self.controller.kinematic
-        watch = Watch(self.safety.guards, model, self._expect, self.safety.rule.tolerance)
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen = first.seen
         self.controller.reset()
@@ -320,22 +321,26 @@ class ClosedLoop:
         turns: bool = True,
     ) -> Step:
         """Command, observe, learn."""
-        first = self.plant.command(self._figures.motors(decision.delta_a))
+        by = "grip" if not turns else "turn" if decision.share > 0 else "retreat"
+        most = decision.delta_a.abs().clamp(min=self.safety.guards.increment)  # play makes no command large
+        motors = self._figures.motors(decision.delta_a).clamp(-most, most)
+        first = self.plant.send(motors, seen, by)
         began = time.perf_counter()
-        verdict = watch.motion(seen, decision, first, self.plant.observe, self.knowledge.servo.stuck)
+        verdict = watch.motion(seen, decision, self.plant.sent, first, self.plant.observe)
         after, progress.halt = verdict.seen, verdict.halt
-        if progress.halt is not None:
-            if progress.halt.reason is not StopReason.ACTUATOR_STUCK:  # the servo model itself finds this one
-                self.plant.correct(None)
-        elif after is not first:
-            self.plant.correct(after)
         increment, moved = after.state.minus(seen.state), after.a - seen.a
+        if progress.halt is not None or after.status is PlantStatus.LOST:  # nobody learns from this reading
+            seconds += time.perf_counter() - began
+            return Step(seen, decision, after, increment, moved, None, seconds, verdict.note)
+        if verdict.encoders:
+            self.plant.learn(after)
+        progress.halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
         report, lin, expected = None, decision.linearization, verdict.expected
         if lin is not None and expected is not None and after.status is PlantStatus.HELD:
             felt = watch.grip.surprise(lin, seen, expected.moved, after)
             # what a guard objects to may be a faulty pad
             fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
-            if verdict.teaches and (self.learn or self._rehearses):
+            if verdict.teaches and progress.halt is None and (self.learn or self._rehearses):
                 report = self._learn(seen, decision, lin, moved, increment, expected, felt, fades)
             if turns and decision.share > 0 and self.controller.enhanced is not None:
                 # moved otherwise than predicted, it slides, or turns out of the grip
@@ -378,7 +383,7 @@ class ClosedLoop:
         if not self.learn:
             return None
         if felt is not None:
-            self._learn_forces(lin, expected.moved, felt)
+            self.knowledge.forces.learn(lin, expected.moved, felt)
         self._figures.learn(lin, moved, ds)
         pull = self._figures.pulled(moved)
         nominal = self.controller.kinematic.followed(lin).step(pull)  # g learns what they leave
@@ -390,12 +395,3 @@ class ClosedLoop:
         """rho of a motion, see :class:`~torch_ekm.control.TrustRegion`."""
         trust = self.controller.pace.options.trust
         return trust.disagreement(expected.increment[-6:], ds[-6:], float(lin.lever), felt)
-
-    def _learn_forces(self, lin: Linearization, moved: Tensor, felt: ForceSurprise) -> None:
-        """Pads that touched and measured before and after teach how their forces answer."""
-        forces, pads = self.knowledge.forces, list(felt.pads)
-        change = torch.full((len(forces.scale),), torch.nan, dtype=torch.float64)
-        change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
-        described = torch.zeros_like(forces.correction)
-        described[pads] = lin.described_normal_sensitivity
-        forces.update(moved, change, described)

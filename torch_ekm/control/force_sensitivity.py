@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,12 +13,13 @@ from .._checks import check_finite, check_shape
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
 
+if TYPE_CHECKING:
+    from ..model import Linearization
+    from .pace import ForceSurprise
+
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _FURTHEST = 5.0  # priors: bounds of theta
-_NOISE_STD, _LARGEST_STD = (
-    0.25,
-    20.0,
-)  # [N] of a change of force that c and B do not explain, at least, at most
+_NOISE_STD, _LARGEST_STD = 0.25, 20.0  # [N] of a change of force that c and B do not explain
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
@@ -86,6 +87,15 @@ class ForceSensitivity(Recorded, nn.Module):
     def begin(self) -> None:
         """A new grasp: nothing drifts yet."""
         self.drift.zero_()
+
+    def learn(self, lin: Linearization, moved: Float[Tensor, " n_a"], felt: ForceSurprise) -> None:
+        """Pads that touched and measured before and after a motion teach how their forces answer."""
+        pads = list(felt.pads)
+        change = torch.full((len(self.theta),), torch.nan, dtype=torch.float64)
+        change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
+        described = torch.zeros_like(self.correction)
+        described[pads] = lin.described_normal_sensitivity
+        self.update(moved, change, described)
 
     @torch.no_grad()
     def update(

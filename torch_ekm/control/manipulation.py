@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from ..exceptions import CommandRefusedError
 from ..plant import Observation
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
@@ -45,6 +47,21 @@ class Stop(NamedTuple):
     cause: BaseException | None = None
     """What the plant raised, or Ctrl-C; ``raise result.stop.cause`` goes on with it."""
 
+    def told(self, more: str) -> Stop:
+        """With one more thing to say, unless it is said already."""
+        if more in self.message:
+            return self
+        return self._replace(message="; ".join(filter(None, (self.message, more))))
+
+    @classmethod
+    def failed(cls, error: BaseException, final: Observation) -> Stop:
+        """What the plant raised, or the gate before it, or Ctrl-C."""
+        if isinstance(error, KeyboardInterrupt):
+            return cls(StopReason.STOPPED, final, "Ctrl-C", error)
+        refused = isinstance(error, CommandRefusedError)
+        reason = StopReason.COMMAND_REFUSED if refused else StopReason.PLANT_FAILED
+        return cls(reason, final, f"{type(error).__name__}: {error}", error)
+
 
 @dataclass(frozen=True)
 class Manipulation:
@@ -58,6 +75,16 @@ class Manipulation:
     def __repr__(self) -> str:
         message = f": {self.stop.message}" if self.stop.message else ""
         return f"<Manipulation: {self.reason.value} after {len(self.steps)} motions{message}>"
+
+    @classmethod
+    def of(cls, target: PoseTarget, focus: FocusedPose, motions: Generator[Step, None, Stop]) -> Manipulation:
+        """All motions, one after the other, to their end."""
+        steps = []
+        while True:
+            try:
+                steps.append(next(motions))
+            except StopIteration as end:
+                return cls(target, focus, tuple(steps), end.value)
 
     @property
     def errors(self) -> list[float]:

@@ -33,12 +33,17 @@ class IdealServos(Recorded, nn.Module):
     """
 
     learns = False
-    moved_from = 0.0
+    moved_from = largest = 0.0
 
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__()
         self.names = tuple(names)
         self.stuck = nn.Buffer(torch.zeros(len(self.names)).bool())
+
+    @property
+    def bias(self) -> Float[Tensor, " n_a"]:
+        """0 [rad]."""
+        return torch.zeros(len(self.names), dtype=torch.float64)
 
     def command(self, wanted: Float[Tensor, " n_a"]) -> Float[Tensor, " n_a"]:
         """v = w: the increments that are wanted, unchanged [rad]."""
@@ -182,6 +187,7 @@ class ServoModel(Recorded, nn.Module):
         error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
         self._open(at, error**2 > 16 * noise * spread, went)
+        error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
         at.estimate[went] += Px * (error / spread)[:, None]
         P = at.covariance[went] - Px[..., None] * Px[:, None, :] / spread[:, None, None]
@@ -215,6 +221,7 @@ class ServoModel(Recorded, nn.Module):
     def _open(self, at: SimpleNamespace, surprising: Mask, which: Mask) -> None:
         """The second surprise in succession: it is another servo, its old estimate is no evidence."""
         again = surprising & (at.surprises[which] > 0)
+        at.estimate[which] = np.where(again[:, None], 0.0, at.estimate[which])
         at.covariance[which] = np.where(again[:, None, None], self._prior.numpy(), at.covariance[which])
         at.surprises[which] = surprising & ~again
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .frames_at_rest import FramesAtRest
+from .gate import Gate
 from .observation import Observation, PlantStatus, Stamps, Truth
 from .plant import Plant
 from .recording_plant import RecordingPlant
@@ -15,6 +16,7 @@ from .wrapper import PlantWrapper
 
 __all__ = [
     "FramesAtRest",
+    "Gate",
     "Observation",
     "Plant",
     "PlantStatus",

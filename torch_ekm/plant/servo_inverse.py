@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 
 from .._checks import check_finite, check_shape
@@ -9,6 +7,7 @@ from ..description import HandDescription
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..typing import Float, Tensor
+from .gate import Gate
 from .observation import Observation
 from .plant import Plant
 from .wrapper import PlantWrapper
@@ -24,8 +23,12 @@ class ServoInverse(PlantWrapper):
         plant.command(delta_a)      # the encoders move by delta_a, as nearly as the servos can
         print(plant.servo)          # dead zones and biases with standard errors
 
+    ``|v - w| <= servo.largest``, and v goes beyond the gate's increment only where w does: no estimate makes
+    a command large. A loop that judges readings itself uses :meth:`send` and :meth:`learn`, so that nothing
+    is learned from one that it refuses.
+
     Args:
-        plant: with encoders (``Observation.a``).
+        plant: with encoders (``Observation.a``); one that is no :class:`Gate` gets one.
         hand: gives names and ranges of the actuators.
         servo: what is known of the servos; None: nothing yet. It belongs to the hand, not to an object: keep
             it from trial to trial (:class:`~torch_ekm.control.HandKnowledge`). With ideal servos commands
@@ -35,11 +38,12 @@ class ServoInverse(PlantWrapper):
     def __init__(
         self, plant: Plant, hand: HandDescription, servo: ServoModel | IdealServos | None = None
     ) -> None:
-        super().__init__(plant)
+        self.gate = plant if isinstance(plant, Gate) else Gate(plant, hand)
+        super().__init__(self.gate)
         self.servo = ServoModel(hand.actuator_names) if servo is None else servo
         self._range = [torch.from_numpy(edge) for edge in (hand.actuator_lower, hand.actuator_upper)]
-        self._seen: Observation | None = None
-        self._motion: tuple[Tensor, Tensor, dict[str, Any]] | None = None
+        self._start = self.sent = torch.zeros(len(self.servo.names), dtype=torch.float64)
+        """v of the last motion [rad]."""
 
     @property
     def stuck(self) -> tuple[str, ...]:
@@ -53,40 +57,33 @@ class ServoInverse(PlantWrapper):
 
         Raises:
             ShapeError, NonFiniteError: the increment is not ``n_a`` finite numbers; nothing moves.
+            EKMError: see :meth:`Gate.command`.
         """
+        after = self.send(delta_a, self.gate.last or self.observe(), "user")
+        self.learn(after)
+        return after
+
+    def send(self, delta_a: Float[Tensor, " n_a"], start: Observation, by: str) -> Observation:
+        """The same from an accepted reading, and nothing is learned; see :meth:`Gate.command`."""
         delta_a, names = torch.as_tensor(delta_a), self.servo.names
         check_shape("delta_a", delta_a, (len(names),), f"in order: {', '.join(names)}")
         check_finite("delta_a", delta_a)
-        seen = self.observe() if self._seen is None else self._seen
-        v = self._within_range(seen.a, self.servo.command(delta_a))
-        after = super().command(v)
-        before = {name: value.clone() for name, value in self.servo.named_buffers()}
-        self._motion = seen.a, v, before
-        self._learn(after)
-        return after
+        added = (self.servo.command(delta_a) - delta_a).clamp(-self.servo.largest, self.servo.largest)
+        most = delta_a.abs().clamp(min=self.gate.increment)
+        v = self._within_range(start.a, (delta_a + added).clamp(-most, most))
+        self._start, self.sent = start.a, v
+        return self.gate.command(v, start, by)
+
+    def learn(self, after: Observation) -> None:
+        """An accepted reading after the last motion."""
+        start, v = self._start, self.sent
+        self.servo.update(v, after.a - start, self._free(start, v, after.a))
 
     def _within_range(self, a: Tensor, v: Tensor) -> Tensor:
         """v, cut where ``a + v`` would lie outside; it is never turned round."""
         lower, upper = self._range
         up, down = (upper - a).clamp(min=0.0), (lower - a).clamp(max=0.0)
         return v.clamp(down, up)
-
-    def correct(self, after: Observation | None) -> None:
-        """What was learned of the last motion is taken back; it is learned again from ``after``, if any.
-
-        Of a motion without any encoder reading that can be believed nothing is learned.
-        """
-        if self._motion is None:
-            return
-        for name, value in self.servo.named_buffers():
-            value.copy_(self._motion[2][name])
-        if after is not None:
-            self._learn(after)
-
-    def _learn(self, after: Observation) -> None:
-        assert self._motion is not None
-        start, v, _ = self._motion
-        self.servo.update(v, after.a - start, self._free(start, v, after.a))
 
     def _free(self, start: Tensor, v: Tensor, end: Tensor) -> Tensor:
         """Motions that no end of the range cut short, nor brought back into it: an end is not a dead zone."""
@@ -96,8 +93,3 @@ class ServoInverse(PlantWrapper):
         for a in (start + v, end):
             free &= ((a > low) | (v > 0)) & ((a < high) | (v < 0))
         return free
-
-    def observation(self, seen: Observation) -> Observation:
-        """Remembered as the start of the next motion."""
-        self._seen = seen
-        return seen

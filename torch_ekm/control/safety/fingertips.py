@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from ...exceptions import GraspError
+from ...model import ModelStatus
 from ...plant import Observation
 from ...typing import Float, Tensor
 from ..decision import Decision, StopReason
@@ -31,6 +32,8 @@ class Fingertips(NamedTuple):
     """[N]; 0 where a pad is not believed, and the model's estimate stands in."""
     note: str = ""
     halt: Objection | None = None
+    true: bool = True
+    """Their scale is that of joints and springs; else nothing is learned from the motion."""
 
 
 def hold(seen: Observation) -> bool:
@@ -77,9 +80,13 @@ class FingertipWatch:
         if dated and not (taken > before.time and abs(seen.time - taken) <= self.guards.max_age.fingertips):
             note = f"the fingertips were read at {taken:.3f} s: the model's estimate stands in"
             return Fingertips(None, note)
-        notes = [] if self._last is not None else self._scale(seen, force)
-        repeats = self._frozen(force, float((seen.a - before.a).abs().max()))
         lin = decision.linearization
+        doubts = () if lin is None else lin.doubts
+        first = self._last is None  # before a grip by wrong pads has changed the forces
+        asked = first or any(doubt.kind is ModelStatus.UNEXPLAINED_TORQUE for doubt in doubts)
+        notes = self._scale(seen, force) if asked else []
+        true = not notes
+        repeats = self._frozen(force, float((seen.a - before.a).abs().max()))
         expected = {} if lin is None else self._normal(lin)
         faults = {i: f"reads {float(force[i]):.2f} N again and again" for i in repeats if i in expected}
         # above the ceiling, or far above what the model had before the motion
@@ -110,7 +117,7 @@ class FingertipWatch:
             force = force.clone()
             force[list(faults)] = 0.0
         notes += [f"{'; '.join(faulty)}: the model's estimate stands in"] if faulty else []
-        return Fingertips(force, "; ".join(notes))
+        return Fingertips(force, "; ".join(notes), true=true)
 
     def _scale(self, seen: Observation, force: Tensor) -> list[str]:
         """All fingertips together read much more or less than joints and springs give."""
@@ -118,8 +125,10 @@ class FingertipWatch:
         measured, other = float(force[list(alone)].sum()), sum(alone.values())
         if len(alone) < 2 or measured / _SCALE < other < measured * _SCALE:
             return []
-        remedy = "check their scale, and the description's springs"
-        return [f"the fingertips read {measured:.1f} N, joints and springs give {other:.1f} N: {remedy}"]
+        return [
+            f"the fingertips read {measured:.1f} N, joints and springs give {other:.1f} N ({_SCALE:g} times "
+            "are allowed): check their scale, and the description's springs; nothing is learned"
+        ]
 
     def _frozen(self, force: Tensor, moved: float) -> list[int]:
         """Pads that read the same again and again while the encoders move."""

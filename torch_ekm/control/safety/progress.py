@@ -147,8 +147,9 @@ class Progress:
             )
 
     def come(self, after: Observation, moved: Tensor) -> None:
-        """One more motion that counts, of the encoders by ``moved`` [rad]."""
-        self.way.append(moved)
+        """One more motion that counts, of the encoders by ``moved`` [rad]; the way back is a command, too."""
+        most = self.safety.guards.increment
+        self.way.append(moved.clamp(-most, most))
         error = self._error(after)
         if error < self._best[0]:
             self._best = error, len(self.way)

@@ -10,7 +10,7 @@ import torch
 
 from ...plant import Observation, PlantStatus
 from ...typing import Array, Tensor
-from ..decision import Decision, Expectation, StopReason
+from ..decision import Expectation, StopReason
 from .fingertips import hold
 from .safety import Guards, Objection
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _DEG = math.pi / 180
 _NAMES = ("the encoders' reading", "the joints' reading", "the object's pose")
+_AGAINST = -0.5  # share of a command that the encoders made, from which they went the other way
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
 
 
@@ -45,20 +46,26 @@ class ReadingTests:
         doubt = self._age(seen) or self._range(seen)
         if before is None or doubt is not None:
             return doubt
-        ds, still = seen.state.minus(before.state).numpy(), torch.zeros_like(before.a)
-        return self._encoders(before, still, seen) or self._jump(ds, 0 * ds, seen)
+        if before.dated and seen.time < before.time:
+            message = f"the clock went back from {before.time:.3f} to {seen.time:.3f} s: check the driver"
+            return Objection(StopReason.STALE_SENSOR, message)
+        ds, still = seen.state.minus(before.state).numpy(), 0 * seen.a
+        return self._encoders(before, still, seen, self.guards.unchanged) or self._jump(ds, 0 * ds, seen)
 
     def after_motion(
         self,
         before: Observation,
-        decision: Decision,
+        sent: Tensor,
         seen: Observation,
         expected: Expectation | None,
         blind: int,
     ) -> Objection | None:
-        """Of a reading after a motion, the worst first; ``blind`` motions without a pose came before."""
-        doubt = self._age(seen, before) or self._range(seen) or self._encoders(before, decision.delta_a, seen)
-        doubt = self._speed(before, seen) if doubt is None else doubt
+        """Of a reading after the motors were sent by ``sent`` [rad], the worst first; ``blind`` motions
+        without a pose came before."""
+        doubt = self._age(seen, before)
+        if doubt is None or doubt.blind:  # the camera alone: the rest is still looked at
+            encoders = self._encoders(before, sent, seen) or self._against(before, sent, seen)
+            doubt = self._range(seen) or encoders or self._speed(before, seen) or doubt
         if expected is None or (doubt is not None and not doubt.blind):
             return doubt
         ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
@@ -127,18 +134,33 @@ class ReadingTests:
                 return Objection(StopReason.OUT_OF_RANGE, message)
         return None
 
-    def _encoders(self, before: Observation, command: Tensor, seen: Observation) -> Objection | None:
-        """An encoder that went further than it was commanded to, or back."""
-        moved, v = (seen.a - before.a).numpy(), command.numpy()
+    def _encoders(
+        self, before: Observation, sent: Tensor, seen: Observation, limit: float | None = None
+    ) -> Objection | None:
+        """An encoder that went further than it was sent, or back."""
+        moved, v, limit = (seen.a - before.a).numpy(), sent.numpy(), limit or self.guards.encoder_jump
         away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))
         i, names = int(away.argmax()), self.hand.actuator_names
-        if away[i] > self.guards.encoder_jump:
+        if away[i] > limit:
             message = (
                 f"encoder '{names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
-                f"(Guards.encoder_jump is {deg(self.guards.encoder_jump)}): check its cable and zero"
+                f"({deg(limit)} more are allowed, Guards.encoder_jump): check its cable and zero"
             )
             return Objection(StopReason.ENCODER_JUMP, message)
         return None
+
+    def _against(self, before: Observation, sent: Tensor, seen: Observation) -> Objection | None:
+        """Encoders that went the other way."""
+        moved, v = (seen.a - before.a).numpy(), sent.numpy()
+        share, i = float(moved @ v) / max(float(v @ v), 1e-12), int((moved * v).argmin())
+        if abs(v).max() < self.guards.unchanged or share > _AGAINST:
+            return None
+        message = (
+            f"encoders made {share:.1f} of the motion that was commanded (limit {_AGAINST:g}): "
+            f"'{self.hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were: a sign of the "
+            "motors or of their encoders is wrong; see 'torch-ekm check --plant'"
+        )
+        return Objection(StopReason.WRONG_WAY, message)
 
     def _speed(self, before: Observation, seen: Observation) -> Objection | None:
         moved, names = (seen.a - before.a).numpy(), self.hand.actuator_names
@@ -196,16 +218,25 @@ class ReadingTests:
     def _deviation(self, before: Observation, expected: Expectation, seen: Observation, blind: int) -> Array:
         """sigma of each entry of an increment, see :class:`~torch_ekm.control.Guards`."""
         guards, n_q, predicted = self.guards, self.hand.n_q, expected.increment.numpy()
-        variance = np.zeros(len(predicted))
-        variance[:n_q] = 2 * guards.joint_noise**2
-        for reading in (before, seen):
-            variance[n_q:] += self._stated(reading)
+        variance = self._noise(before, seen)
         # blind motions before this one left the pose as unsure as the model is
         share = guards.relative * (1 + blind)
         way, turn = (math.sqrt(part @ part) for part in (predicted[-6:-3], predicted[-3:]))
         along, about = way + _LEVER * turn, turn + way / _LEVER
         size = np.array([abs(predicted[:n_q]).max()] * n_q + [along] * 3 + [about] * 3)
         return np.sqrt(variance + (share * size) ** 2 + expected.deviation.numpy() ** 2)
+
+    def _noise(self, before: Observation, seen: Observation) -> Array:
+        """Variances of a measured increment ``(n_s,)``."""
+        joints = np.full(self.hand.n_q, 2 * self.guards.joint_noise**2)
+        return np.concatenate([joints, self._stated(before) + self._stated(seen)])
+
+    def share(self, before: Observation, seen: Observation, predicted: Tensor) -> tuple[float, float]:
+        """How much of a predicted increment was made, and the size of that in standard deviations."""
+        ds, wanted = seen.state.minus(before.state).numpy(), predicted.numpy()
+        weighted = wanted / self._noise(before, seen)
+        size = float(wanted @ weighted)
+        return float(ds @ weighted) / max(size, 1e-12), math.sqrt(size)
 
     def _stated(self, reading: Observation) -> Array:
         """Variances of a pose ``(6,)``: as stated, and no less than what the guards allow."""

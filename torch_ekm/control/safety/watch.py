@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import math
 from collections.abc import Callable
@@ -10,11 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from ...exceptions import GraspError
+from ...kinematics import ServoModel
+from ...kinematics.servo_model import IdealServos
 from ...plant import Observation, PlantStatus
-from ...typing import Array, Tensor
+from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
-from .fingertips import FingertipWatch
+from .consistency import Consistency
+from .fingertips import Fingertips, FingertipWatch
 from .grip import GripWatch
 from .readings import ReadingTests, agree, deg
 from .safety import Guards, Objection
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
-_STRETCH = 12 * _DEG  # tendons stretch by less
-_ARMS = 0.35  # and moment arms that are not as described change it by this share of the way
 _UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
 _ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
@@ -43,6 +42,8 @@ class Verdict(NamedTuple):
     """What a guard objects to where the loop goes on."""
     expected: Expectation | None = None
     """What f + g predict of what the encoders did; None: the model has no step."""
+    encoders: bool = True
+    """The servos may be learned from them."""
 
 
 class Watch:
@@ -53,6 +54,7 @@ class Watch:
         model: f, with the hand.
         expect: f + g of what the encoders did, from where the model was linearized.
         tolerance: of the target [rad]; errors that grow by more are no noise.
+        servo: what is known of the servos; None: they are ideal.
     """
 
     def __init__(
@@ -61,9 +63,12 @@ class Watch:
         model: KinematicModel,
         expect: Callable[[Linearization, Tensor], Expectation],
         tolerance: float = math.inf,
+        servo: ServoModel | IdealServos | None = None,
     ) -> None:
         self.guards, self.hand, self._expect = guards, model.hand, expect
         self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
+        servo = IdealServos(model.hand.actuator_names) if servo is None else servo
+        self.consistency = Consistency(self.readings, model, servo)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0
@@ -71,9 +76,10 @@ class Watch:
         self.grip = GripWatch(model)
         self.slid = ""
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
+        self.lie = ""
+        """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
         self._tolerance, self._away = tolerance, 0
-        self._begun: Observation | None = None
         self._undated = ""
         """That readings have no date, until it is said."""
 
@@ -86,47 +92,29 @@ class Watch:
                 break
             seen = look()
         self.readings.follow(None, seen)
-        self._begun = seen
+        self.consistency.begin(seen)
         self._undated = "" if seen.dated else _UNDATED
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return Verdict(seen, doubt is None, doubt)
 
     def command(self, decision: Decision, seen: Observation) -> Objection | None:
-        """Why a motion is refused before it is made; None: it is not."""
-        size = decision.delta_a.abs()
-        i = int(size.argmax())
-        if size[i] <= self.guards.increment:
-            return self.fingertips.before(decision, seen)
-        message = (
-            f"a command of {deg(size[i])} to actuator '{self.hand.actuator_names[i]}', Guards.increment is "
-            f"{deg(self.guards.increment)}: correct the controller, or raise the limit"
-        )
-        return Objection(StopReason.COMMAND_CEILING, message)
+        """Why a motion is refused before it is made; None: it is not. Its size is the gate's concern."""
+        return self.fingertips.before(decision, seen)
 
     def motion(
         self,
         before: Observation,
         decision: Decision,
+        sent: Tensor,
         after: Observation,
         look: Callable[[], Observation],
-        stuck: Tensor,
     ) -> Verdict:
-        """Judge a motion; where its reading is in doubt, ``look`` gives another.
-
-        Args:
-            stuck: which actuators the servo model calls so.
-        """
+        """Judge a motion of the motors by ``sent`` [rad]; where its reading is in doubt, ``look`` gives
+        another."""
         self.slid = ""
-        seen, last, doubt, expected = after, None, None, None
-        for left in range(self.guards.looks, -1, -1):
-            if seen.status is PlantStatus.LOST:
-                return Verdict(seen, False)
-            if decision.linearization is not None and (last is None or not torch.equal(seen.a, last.a)):
-                expected = self._expect(decision.linearization, seen.a - before.a)
-            doubt = self.readings.after_motion(before, decision, seen, expected, self.blind)
-            if left == 0 or (doubt is None and not self.fingertips.high(seen)):
-                break
-            last, seen = seen, _with_events(look(), seen)
+        seen, last, doubt, expected = self._look(before, decision, sent, after, look)
+        if seen.status is PlantStatus.LOST:
+            return Verdict(seen, False)
         if doubt is not None and not (doubt.blind or doubt.gated):
             if doubt.reason is StopReason.POSE_JUMP:
                 self.slid = self._slid(decision, before, expected, last, seen)
@@ -136,11 +124,53 @@ class Watch:
         if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
             doubt = doubt._replace(blind=True)
         tips = self.fingertips.judge(before, decision, seen)
-        halt = self._stuck(before, decision, seen, stuck) or tips.halt
         self.readings.follow(before, seen)
         if tips.force is not seen.fingertip_force:
             seen = dataclasses.replace(seen, fingertip_force=tips.force)
-        measured = self.blind == 0
+        verdict = self._verdict(before, seen, doubt, expected, tips)
+        if (doubt is not None and doubt.blind) or self.slid:
+            return verdict
+        odd, halt = self.consistency.motion(before, sent, seen, expected, decision.linearization)
+        if odd is None:
+            self.lie = self.lie or ("" if tips.true else tips.note)
+            return verdict if tips.true else verdict._replace(teaches=False)
+        if odd.encoders:
+            self.lie = odd.message
+        note = "; ".join(filter(None, (verdict.note, odd.message)))
+        halt = verdict.halt or halt
+        return verdict._replace(teaches=False, halt=halt, note=note, encoders=not odd.encoders)
+
+    def _look(
+        self,
+        before: Observation,
+        decision: Decision,
+        sent: Tensor,
+        seen: Observation,
+        look: Callable[[], Observation],
+    ) -> tuple[Observation, Observation | None, Objection | None, Expectation | None]:
+        """The reading to be judged, the look before it, what speaks against it, and what was expected."""
+        last, expected = None, None
+        for left in range(self.guards.looks, -1, -1):
+            if seen.status is PlantStatus.LOST:
+                break
+            if decision.linearization is not None and (last is None or not torch.equal(seen.a, last.a)):
+                expected = self._expect(decision.linearization, seen.a - before.a)
+            doubt = self.readings.after_motion(before, sent, seen, expected, self.blind)
+            if left == 0 or (doubt is None and not self.fingertips.high(seen)):
+                return seen, last, doubt, expected
+            last, seen = seen, _with_events(look(), seen)
+        return seen, last, None, expected
+
+    def _verdict(
+        self,
+        before: Observation,
+        seen: Observation,
+        doubt: Objection | None,
+        expected: Expectation | None,
+        tips: Fingertips,
+    ) -> Verdict:
+        """Of a reading with which the loop goes on, unless fingertips or too many blind motions end it."""
+        measured, halt = self.blind == 0, tips.halt
         if doubt is not None and doubt.blind:
             self.blind += 1
             seen, most = self._predicted(before, expected, seen), self.guards.blind_motions
@@ -195,32 +225,7 @@ class Watch:
 
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
-        hand, found = self.hand, ""
-        off, way = self._stretch(seen), seen.a.numpy() - hand.actuator_offset
-        if self._begun is not None and not torch.equal(self._begun.a, seen.a):  # since the beginning
-            off, way = off - self._stretch(self._begun), (seen.a - self._begun.a).numpy()
-        most = _STRETCH + _ARMS * abs(way)
-        i = int((abs(off) - most).argmax())
-        if abs(off[i]) > most[i]:
-            joints = zip(hand.joint_names, hand.actuation_jacobian[i], strict=True)
-            names = ", ".join(name for name, arm in joints if arm)
-            found = f"; encoder '{hand.actuator_names[i]}' and its joints ({names}) differ by {deg(off[i])}"
-        force = seen.fingertip_force
-        with contextlib.suppress(GraspError):
-            touching = self.fingertips.model.touching(seen.state).finger
-            pressed = (
-                [] if force is None else [pad.name for pad, f in zip(hand.pads, force, strict=True) if f > 1]
-            )
-            away = ", ".join(name for name in pressed if name not in touching)
-            if away:
-                found += f"; fingertips press ({away}) where pose and joints have them off the object"
-        return found and f"{found}: check these sensors, and the pose"
-
-    def _stretch(self, seen: Observation) -> Array:
-        """``a - a_0 - J_a q`` [rad]."""
-        hand = self.hand
-        stretch: Array = seen.a.numpy() - hand.actuator_offset - hand.actuation_jacobian @ seen.q.numpy()
-        return stretch
+        return self.consistency.suspects(seen)
 
     def forget(self) -> None:
         """Signs of a loss are heeded: the hand goes back."""
@@ -234,10 +239,14 @@ class Watch:
         doubtful = seen.status is PlantStatus.NOT_SEEN or self.readings.at_rest(seen, before) is not None
         return before if doubtful else seen
 
-    def _stuck(
+    def stuck(
         self, before: Observation, decision: Decision, seen: Observation, stuck: Tensor
     ) -> Objection | None:
-        """Actuators that do not move, however they are commanded."""
+        """Actuators that do not move, however they are commanded.
+
+        Args:
+            stuck: which the servo model calls so.
+        """
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
         again = still & (size > self.guards.stuck_command)
         self._still = torch.where(again, self._still + 1, 0 * self._still)

@@ -1,0 +1,144 @@
+"""What a hand is doing, on disk: a process that is killed in mid-turn is started again, and goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..exceptions import FileFormatError, ResumeError
+from ..plant import Observation, PlantStatus
+from ..residual.files import read, write
+from .closed_loop import ClosedLoop
+from .focus import PoseTarget
+from .manipulation import Manipulation, Step, Stop
+
+_KIND = "turn under way"
+
+
+class Journal:
+    """One file, written whole before the first motion and after each: target, where the hand stood, and what
+    was learned until then. ::
+
+        journal = Journal("turn.ekm")
+        result = journal.run(loop, target)
+
+    and where that process was killed, in the next one::
+
+        loop = ClosedLoop(plant, controller)  # made as before; what was learned comes from the file
+        result = journal.resume(loop) if journal.cut_short else journal.run(loop, target)
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: str | os.PathLike) -> None:
+        self.path = Path(path)
+
+    @property
+    def cut_short(self) -> bool:
+        """There is a turn that did not come to its end.
+
+        Raises:
+            FileFormatError: the file is no journal.
+        """
+        return self.path.exists() and not self._read()["reason"]
+
+    def run(self, loop: ClosedLoop, target: PoseTarget) -> Manipulation:
+        """As :meth:`ClosedLoop.run`.
+
+        Raises:
+            OutputError: the file cannot be written; the hand holds.
+        """
+        return Manipulation.of(target, loop.controller.focus, self.steps(loop, target))
+
+    def steps(self, loop: ClosedLoop, target: PoseTarget) -> Generator[Step, None, Stop]:
+        """As :meth:`ClosedLoop.steps`."""
+        self._write(loop, target, loop.plant.observe(), 0)
+        with contextlib.closing(loop.steps(target)) as motions:
+            k = 0
+            while True:
+                try:
+                    step = next(motions)
+                except StopIteration as end:
+                    stop: Stop = end.value
+                    self._write(loop, target, stop.final, k, stop.reason.value)
+                    return stop
+                k += 1
+                self._write(loop, target, step.after, k)
+                yield step
+
+    def resume(self, loop: ClosedLoop) -> Manipulation:
+        """Hold, take over what was learned, and go on to the target of the file.
+
+        Raises:
+            ResumeError: there is nothing to go on with, the hand is another one, it has lost its object, or
+                it stands farther from where the file has it than one motion goes. It holds, and nothing is
+                taken over.
+            StateMismatchError: the learner is another one than before.
+            EKMError: what the plant raises.
+        """
+        loop.hold()
+        known, here = self._read(), loop.plant.observe()
+        against = self._against(loop, known, here)
+        if against:
+            raise ResumeError(self.path, against)
+        loop.learned.load(known["learned"])
+        target = PoseTarget(known["target"]["position"], known["target"]["rotation"])
+        return Manipulation.of(target, loop.controller.focus, self.steps(loop, target))
+
+    def _against(self, loop: ClosedLoop, known: dict[str, Any], here: Observation) -> str:
+        """Why the turn is not gone on with; empty: it is."""
+        hand, guards, last = loop.controller.kinematic.hand, loop.safety.guards, known["seen"]
+        if known["reason"]:
+            return f"the turn came to its end: {known['reason']}"
+        if known["actuators"] != list(hand.actuator_names):
+            return f"it is of a hand with the actuators {', '.join(known['actuators'])}"
+        if here.status is PlantStatus.LOST:
+            return "the object is lost: grasp it again"
+        way = (here.a - last["a"]).abs()
+        i, most = int(way.argmax()), guards.increment + guards.encoder_jump
+        if way[i] > most:
+            return (
+                f"encoder '{hand.actuator_names[i]}' stands {math.degrees(way[i]):.1f} deg from where it was "
+                f"({math.degrees(most):.0f} deg are one motion): begin a new turn"
+            )
+        if here.status is PlantStatus.NOT_SEEN:
+            return "" if last["seen"] else "the object was not seen, neither then nor now: clear the view"
+        off = PoseTarget(last["position"], last["rotation"]).error(here.state)
+        shift, turn = (float(torch.linalg.vector_norm(part)) for part in (off[:3], off[3:]))
+        if last["seen"] and (shift > guards.translation_jump or turn > guards.rotation_jump):
+            return (
+                f"the object is {1e3 * shift:.0f} mm and {math.degrees(turn):.0f} deg from where it was: "
+                "begin a new turn"
+            )
+        return ""
+
+    def _write(
+        self, loop: ClosedLoop, target: PoseTarget, seen: Observation, motions: int, reason: str = ""
+    ) -> None:
+        state = {
+            "learned": loop.learned.state(),
+            "target": {"position": target.position, "rotation": target.rotation},
+            "seen": {
+                "a": seen.a, "position": seen.position, "rotation": seen.rotation,
+                "seen": seen.status is PlantStatus.HELD,
+            },
+            "motions": motions,
+            "reason": reason,
+            "actuators": list(loop.controller.kinematic.hand.actuator_names),
+        }  # fmt: skip
+        write(self.path, {"class": _KIND}, state)
+
+    def _read(self) -> dict[str, Any]:
+        if not self.path.exists():
+            raise ResumeError(self.path, "there is no such file")
+        described, state = read(self.path)
+        if described.get("class") != _KIND or not {"learned", "target", "seen", "reason"} <= {*state}:
+            raise FileFormatError(self.path, "no journal of a turn")
+        return state

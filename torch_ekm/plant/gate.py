@@ -1,0 +1,170 @@
+"""The last gate: the only way to a motor."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+from collections.abc import Callable, Iterator
+from typing import NoReturn
+
+import torch
+
+from ..description import HandDescription
+from ..exceptions import CommandRefusedError, PlantInUseError
+from ..typing import Float, Tensor
+from .observation import Observation
+from .plant import Plant
+from .readable import readable
+from .wrapper import PlantWrapper
+
+_DEG = math.pi / 180
+_ROUNDED = 1e-9  # [rad] of a limit: sums of floats
+_OWNERS: dict[int, Gate] = {}  # of plants, by the identity of the innermost one
+_OWNING = threading.Lock()
+
+
+class Gate(PlantWrapper):
+    """A plant that is sent nothing but::
+
+        v finite,  |v_i| <= increment,  min(lower_i, a_i) <= a_i + v_i <= max(upper_i, a_i),
+        sum |v|_max over any time t <= increment + speed t
+
+    a is an encoder reading that was accepted: one outside the range leaves the way back into it. t is the
+    plant's own clock; an undated one has no rate. ``v = 0``, to hold, passes always.
+
+    Readings are made :func:`~torch_ekm.plant.readable.readable`, so a plant of eighteen lines is as safe as
+    one of ours. A :class:`~torch_ekm.control.ClosedLoop` puts a gate before its plant, behind the inverse of
+    the servos and the play; put one before a plant that you command yourself::
+
+        plant = Gate(MyHand(), hand)
+        plant.command(delta_a)      # CommandRefusedError instead of a motion that is too large
+
+    Args:
+        plant: a driver.
+        hand: gives names, ranges and lengths.
+        increment: largest command to an actuator [rad].
+        speed: of commands, mean over a stretch of time [rad/s].
+    """
+
+    def __init__(
+        self, plant: Plant, hand: HandDescription, *, increment: float = 20 * _DEG, speed: float = 3.0
+    ) -> None:
+        super().__init__(plant)
+        self._hand, self.increment, self.speed = hand, increment, speed
+        self._range = [torch.from_numpy(edge) for edge in (hand.actuator_lower, hand.actuator_upper)]
+        self._left, self._since = increment, math.inf  # way that may be commanded at once, and when it was so
+        self._one_at_a_time = threading.RLock()
+        self.last: Observation | None = None
+        """The newest reading that could be read."""
+        self.failure: Exception | None = None
+        """What the plant raised last, or this gate."""
+
+    @contextlib.contextmanager
+    def owned(self) -> Iterator[None]:
+        """Nobody else commands the plant meanwhile, by whatever wrappers.
+
+        Raises:
+            PlantInUseError: somebody does so already.
+        """
+        plant = _innermost(self.plant)
+        with _OWNING:
+            if id(plant) in _OWNERS:
+                raise PlantInUseError(type(plant).__name__)
+            _OWNERS[id(plant)] = self
+        try:
+            yield
+        finally:
+            with _OWNING:
+                del _OWNERS[id(plant)]
+
+    def reset(self, seed: int) -> Observation:
+        """Grasp again; the clock may begin anew."""
+        self._left, self._since = self.increment, math.inf
+        return self._read(lambda: self.plant.reset(seed))
+
+    def observe(self) -> Observation:
+        """Read the sensors.
+
+        Raises:
+            EKMError: see :func:`~torch_ekm.plant.readable.readable`.
+        """
+        return self._read(self.plant.observe)
+
+    def command(
+        self, delta_a: Float[Tensor, " n_a"], start: Observation | None = None, by: str = "user"
+    ) -> Observation:
+        """Move the actuators by ``delta_a`` [rad], wait, read the sensors.
+
+        Args:
+            start: the accepted reading from which it goes; None: the newest one.
+            by: who asks, for the message.
+
+        Raises:
+            CommandRefusedError: nothing was sent; the error says what was asked, by whom, and what
+                is allowed.
+            PlantInUseError: somebody else commands this plant.
+        """
+        owner = _OWNERS.get(id(_innermost(self.plant)))
+        with contextlib.nullcontext() if owner is self else self.owned():
+            v = self._check(delta_a, start, by)
+            return self._read(lambda: self.plant.command(v))
+
+    def _check(self, delta_a: object, start: Observation | None, by: str) -> Tensor:
+        """v in float64, or a refusal."""
+        names, kind = self._hand.actuator_names, f"a {type(delta_a).__name__}"
+        try:
+            v = torch.as_tensor(delta_a).detach().to("cpu", torch.float64)
+            kind = f"{tuple(v.shape)} numbers"
+        except (TypeError, ValueError, RuntimeError):
+            v = torch.empty(0)
+        if v.shape != (len(names),):
+            self._refuse("the hand", by, kind, f"{len(names)} numbers [rad]: {', '.join(names)}")
+        if not bool(v.any()):  # NaN is not 0
+            return v
+        a = (start or self.last or self.observe()).a
+        lower, upper = torch.minimum(self._range[0], a), torch.maximum(self._range[1], a)
+        size, goal, left = v.abs(), a + v, self._budget(start or self.last)
+        most = f"up to {self.increment / _DEG:.3g} deg (Guards.increment)"
+        rate = f"{left / _DEG:.3g} deg now, at {self.speed / _DEG:.4g} deg/s: wait for the end of a motion"
+        for wrong, what, value, allowed in (
+            (~v.isfinite(), "an increment", v, "finite ones"),
+            (size > self.increment + _ROUNDED, "an increment", v, most),
+            (torch.maximum(lower - goal, goal - upper) > _ROUNDED, "a set-point", goal, "{} to {} deg"),
+            (size > left + _ROUNDED, "an increment", v, rate),
+        ):
+            if bool(wrong.any()):
+                i = int(wrong.int().argmax())
+                ends = [f"{float(edge[i]) / _DEG:.4g}" for edge in self._range]
+                asked = f"{what} of {float(value[i]) / _DEG:.4g} deg"
+                self._refuse(f"actuator '{names[i]}'", by, asked, allowed.format(*ends))
+        self._left = left - float(size.max())
+        return v
+
+    def _budget(self, start: Observation | None) -> float:
+        """How far a command may go by the rate [rad]; a clock that goes back was set anew."""
+        if start is None or not start.dated or start.time < self._since:
+            self._left = self.increment
+        else:
+            self._left = min(self.increment, self._left + self.speed * (start.time - self._since))
+        self._since = math.inf if start is None else start.time
+        return self._left
+
+    def _refuse(self, what: str, by: str, asked: str, allowed: str) -> NoReturn:
+        self.failure = CommandRefusedError.by_gate(what, by, asked, allowed)
+        raise self.failure
+
+    def _read(self, ask: Callable[[], Observation]) -> Observation:
+        with self._one_at_a_time:
+            try:
+                self.last = readable(ask(), self._hand)
+            except Exception as error:
+                self.failure = error
+                raise
+        return self.last
+
+
+def _innermost(plant: Plant) -> Plant:
+    while isinstance(plant, PlantWrapper):
+        plant = plant.plant
+    return plant
