@@ -37,3 +37,24 @@ def test_no_path_is_waited_for(kind: str, tmp_path: Path) -> None:
         with pytest.raises(EKMError):
             hostile_files.KINDS[kind].read(path)
         assert hostile_files.read_one(kind, path).what == "refused", what
+
+
+ANNOUNCE = {
+    ("learner", "capacity"): "announce",
+    ("learner", "capacity, 1e9"): "announce",
+    ("learner", "array"): "damaged",
+    ("learner", "overlapping"): "larger than the file",
+    ("trial", "unwritten"): "announce",
+    ("trial", "texts"): "no figures",
+    ("trial", "elsewhere"): "lies in another file",
+    ("csv", "wide"): "at most 4096",
+    ("csv", "a long field"): "more than 1048576 characters",
+}
+
+
+@pytest.mark.parametrize(("kind", "what"), ANNOUNCE)
+def test_what_asks_for_more_than_there_is_is_refused_for_it(kind: str, what: str, tmp_path: Path) -> None:
+    path = tmp_path / hostile_files.KINDS[kind].name
+    hostile_files.KINDS[kind].made[what](path)
+    with pytest.raises(EKMError, match=ANNOUNCE[kind, what]):
+        hostile_files.KINDS[kind].read(path)

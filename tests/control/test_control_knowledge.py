@@ -210,6 +210,12 @@ def test_whatever_is_learned_can_be_loaded(generator) -> None:
         figures.update(draw(5), draw(5, n), draw(5).square() + 1e-6)
         for part in (servo, forces, figures):
             assert part.state_problems(part.state_dict()) == []
+    S, w = torch.full((1, 1), 5.0).double(), torch.full((1,), 0.1).double()
+    pad = ForceSensitivity(1, 1)
+    for _ in range(200):  # one that answers fifty times as much as it is described to
+        pad.update(w, 50 * S @ w, S)
+    assert 4 < float(pad.theta.abs().max()) <= 5
+    assert pad.state_problems(pad.state_dict()) == []
     ideal = ServoModel("a")
     for _ in range(3000):  # encoders that never err
         ideal.update(torch.full((1,), 0.01), torch.full((1,), 0.01))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import time
 from pathlib import Path
 
 import pytest
 
 from torch_ekm.description import load_hand, load_object
+from torch_ekm.description.registry import hand_paths, object_paths
 from torch_ekm.exceptions import DescriptionError
 
 HAND, BOX = load_hand("planar_two_finger"), load_object("box")
@@ -126,3 +129,50 @@ def test_the_longest_hand_that_is_read(tmp_path: Path) -> None:
     hand = load_hand(tmp_path / "my.urdf")
     assert hand.n_q == n - 1
     assert time.process_time() - start < _PATIENCE
+
+
+FILES = {  # of a hand and of an object, and what reads them
+    "hand.urdf": load_hand,
+    "hand.transmission.toml": load_hand,
+    "thing.urdf": load_object,
+    "thing.object.toml": load_object,
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_text_is_utf_8_whoever_wrote_it(name: str, tmp_path: Path) -> None:
+    for source in (*hand_paths("planar_two_finger"), *object_paths("box")):
+        stem = "hand" if "planar" in source.name else "thing"
+        shutil.copy(source, tmp_path / f"{stem}{''.join(source.suffixes)}")
+    path, read = tmp_path / name, FILES[name]
+    text, first = path.read_text(encoding="utf-8"), tmp_path / f"{name.partition('.')[0]}.urdf"
+    plain = read(first)
+    comment = "<!-- Größe -->" if name.endswith("urdf") else "# Größe\n"
+    written = text.replace("?>", f"?>{comment}", 1) if name.endswith("urdf") else comment + text
+    for change in ("\n", "\r\n"):
+        path.write_bytes(written.replace("\n", change).encode("utf-8-sig"))
+        assert repr(read(first)) == repr(plain)
+    for encoding, named in (
+        ("latin-1", "LATIN1"),
+        ("utf-16", "UTF-16"),
+        ("utf-32", "UTF-32"),
+        ("utf-16-le", "UTF-16LE"),
+    ):
+        path.write_bytes(written.encode(encoding))
+        with pytest.raises(DescriptionError, match=f"{name}.*iconv -f {named} -t UTF-8"):
+            read(first)
+
+
+@pytest.mark.parametrize(
+    "figure", ["0_1", "1_000.0", "０.１", "0x1p3", "1,5", "1e", "infinity", "nan", "1 2"]
+)
+def test_figures_of_a_urdf_are_those_of_the_standard(figure: str, tmp_path: Path) -> None:
+    for source in object_paths("box"):
+        shutil.copy(source, tmp_path / f"thing{''.join(source.suffixes)}")
+    path = tmp_path / "thing.urdf"
+    text = path.read_text(encoding="utf-8")
+    path.write_text(re.sub(r'<mass value="[^"]*"', f'<mass value="{figure}"', text), encoding="utf-8")
+    with pytest.raises(DescriptionError, match="'value' must be a finite number"):
+        load_object(path)
+    path.write_text(re.sub(r'<mass value="[^"]*"', '<mass value=" +.25E0 "', text), encoding="utf-8")
+    assert load_object(path).mass == 0.25

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -57,8 +58,8 @@ BROKEN = {
     "a comment too late": ("a,b,y\n1,2,3\n# gripper opens\n", r"line 3 has 1 fields"),
     "an open quote": ('a,b,y\n1,2,"3\n' + GOOD, r"line 52, column 'y': '3"),
     "one long field": (f"a,b,y\n1,2,3\n1,{'9' * 200_000},3\n", r"line 3: field larger than field limit"),
-    "a long line": ("a,b,y\n" + "1," * 600_000, r"line 2 ends 1048576 characters without"),
-    "nothing but lines": ("\n" * 2_000_000, r"line 1048577 ends 1048576 characters without a figure"),
+    "a long line": ("a,b,y\n" + "1," * 600_000, r"line 2 has more than 1048576 characters"),
+    "nothing but lines": ("\n" * 2_000_000, r"line 1048577 ends a megabyte of empty lines"),
     "wide": (",".join(f"a{i}" for i in range(100_000)) + "\n", r"100000 columns; at most 4096"),
     "spread over lines": ("a,b,y\n" + '"1\n",' * 300_000, r"in a quote that does not close"),
     "no numbers of its own": ("# a,b,y\n1,2,3\n", r"line 2 holds numbers only"),
@@ -158,6 +159,35 @@ def test_parquet_is_csv(tmp_path: Path) -> None:
     (tmp_path / "fake.parquet").write_text("no")
     with pytest.raises(DescriptionError, match="no Parquet file"):
         load_table(tmp_path / "fake.parquet")
+
+
+def test_a_damaged_parquet_is_not_read_as_if_whole(tmp_path: Path) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    values, path = table(), tmp_path / "a.parquet"
+    columns = pyarrow.table(dict(zip("abcy", values.T, strict=True)))
+    parquet.write_table(columns, path, write_page_checksum=True)
+    whole, draw, refused = path.read_bytes(), np.random.default_rng(1), 0
+    for place in draw.integers(4, len(whole) - 4, 80):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :])
+        try:
+            names, read = open_table(path)
+            np.testing.assert_array_equal(read(names), values)
+        except DescriptionError:
+            refused += 1
+    assert refused > 60
+    parquet.write_table(columns, path, compression="none")  # no checksums
+    whole = path.read_bytes()
+    for value in (1e3, -1e3):
+        path.write_bytes(whole.replace(struct.pack("<d", values[7, 1]), struct.pack("<d", value)))
+        names, read = open_table(path)
+        np.testing.assert_array_equal(read("acy"), values[:, [0, 2, 3]])
+        with pytest.raises(DescriptionError, match="column 'b' does not hold what its statistics say"):
+            read("b")
+    lost = whole.replace(b"PAR1", b"PAR0", 1)[: len(whole) // 2]
+    path.write_bytes(lost)
+    with pytest.raises(DescriptionError, match="no Parquet file"):
+        open_table(path)
 
 
 def test_targets_are_named_or_found(tmp_path: Path) -> None:

@@ -101,7 +101,9 @@ def _records(path: Path, content: bytes, before: int, separator: str) -> Iterato
         for line in itertools.islice(_text(content), before, None):
             length += len(line)
             if length > _LONGEST:
-                problem = f"ends {_LONGEST} characters without a figure, or in a quote that does not close"
+                problem = "ends a megabyte of empty lines, or stands in a quote that does not close"
+                if len(line) > _LONGEST:
+                    problem = f"has more than {_LONGEST} characters"
                 raise DescriptionError(path, f"line {before + reader.line_num + 1} {problem}")
             yield line
 
