@@ -118,7 +118,7 @@ class _Topic:
         """Places in the file between which its clock was set back: few; else two clocks take turns."""
         places: list[tuple[int, int]] = []
         for times in map(np.array, (self.logged, self.stamp)):
-            stays = np.append(times[2:] < times[:-2], True)[: len(times) - 1]  # else one message was late
+            stays = np.append(times[2:] < times[:-2], False)[: len(times) - 1]  # else one message was late
             fallen = np.flatnonzero((np.diff(times) < -1e9 * _BACK) & stays)
             if len(fallen) <= max(1, len(times) // 20):
                 places += [(self.place[k], self.place[k + 1]) for k in fallen]
