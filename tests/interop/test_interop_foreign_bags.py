@@ -187,13 +187,16 @@ def test_a_message_counts_from_its_stamp_and_the_latency_is_stated(ros, tmp_path
     heard: list[Heard] = []
     for k in range(80):
         t = 1 + 0.02 * k
-        heard.append((t + 0.045, "/leap", ros.joints(t, "", [k, -k])))
+        late = 1.4 if k == 40 else 0.045  # a network that hangs for a moment
+        heard.append((t + late, "/leap", ros.joints(t, "", [k, -k])))
         heard.append((t + 0.001, "/u", ros.array(k)))
     heard.sort(key=lambda one: one[0])
     table = read_bag(ros.write(tmp_path, heard), "/u")
     assert column(table, "/leap.position[1]").tolist() == [-k for k in range(80)]
     assert table.age[:, table.names.index("/leap.position[0]")] == pytest.approx(np.full(80, 0.001))
-    assert table.notes == ("/leap counts from its header.stamp, 45 ms before it was logged (at most 45 ms)",)
+    assert table.notes == (
+        "/leap counts from its header.stamp, 45 ms before it was logged (at most 1.4e+03 ms)",
+    )
 
 
 def test_rows_are_in_the_order_of_time_whoever_wrote_them(ros, tmp_path) -> None:

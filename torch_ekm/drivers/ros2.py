@@ -20,7 +20,7 @@ from .one_master import OneMaster
 from .pose import Sighting
 
 _KINDS = ("trajectory", "array", "joint_state")
-_TIMEOUT = 3.0  # [s] for the first message and the first subscriber
+_TIMEOUT = 5.0  # [s] for the first message and the first subscriber: discovery takes a while
 _DISCOVERED = 0.4  # [s] by then a node that runs is known
 _ONLY_RELIABLE = " ([bus] reliable = true hears reliable publishers only)"
 _SYNCHRONOUS = 0.02  # [s] of clocks: less is not worth a note

@@ -48,10 +48,10 @@ class BagTable(NamedTuple):
 def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTable:
     """A recording as a table: a row for each message of ``clock``, with the newest values of other topics.
 
-    Nothing of the future enters a row. A message counts from its ``header.stamp`` on, where that runs with
-    the log's clock, at most 1 s before it; else from when it was logged. A value is NaN before its first
-    message, where its array has got shorter, and once it is older than ten mean intervals of its column.
-    Texts, headers and fields of more than 64 numbers are left out.
+    Nothing that was measured later enters a row. A message counts from its ``header.stamp`` on, where that
+    runs with the log's clock, at most 1 s before it; else from when it was logged. A value is NaN before its
+    first message, where its array has got shorter, and once it is older than ten mean intervals of its
+    column. Texts, headers and fields of more than 64 numbers are left out.
 
     Args:
         path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
@@ -121,8 +121,9 @@ class _Topic:
     def fell(self) -> list[tuple[int, int]]:
         """Places in the file between which its clock was set back: few; else two clocks take turns."""
         places: list[tuple[int, int]] = []
-        for times in (self.logged, self.stamp):
-            fallen = np.flatnonzero(np.diff(times) < -1e9 * _BACK)
+        for times in map(np.array, (self.logged, self.stamp)):
+            stays = np.append(times[2:] < times[:-2], False)[: len(times) - 1]  # else one message was late
+            fallen = np.flatnonzero((np.diff(times) < -1e9 * _BACK) & stays)
             if len(fallen) <= max(1, len(times) // 20):
                 places += [(self.place[k], self.place[k + 1]) for k in fallen]
         return places
@@ -130,15 +131,16 @@ class _Topic:
     def measured(self, begin: int) -> tuple[Array, str]:
         """When each message counts [s from a time of the log on], and what is to be said of it."""
         logged, stamp = (1e-9 * (np.array(times) - begin) for times in (self.logged, self.stamp))
-        if not any(self.stamp) or len(set(self.stamp)) < len(stamp) / 2:  # none, or it stands
+        stamped = np.array(self.stamp) != 0
+        if len(set(self.stamp)) < len(stamp) / 2 or not stamped.any():  # none, or it stands
             return logged, ""
-        late = logged - stamp
+        late = (logged - stamp)[stamped]
+        middle, most = float(np.median(late)), float(late.max())
         if np.mean((late > _EARLY) & (late < _LATE)) < 0.95:  # a network may hang for a moment
-            off = float(np.median(late))
-            return logged, f"{self.name} has a header.stamp {off:.4g} s before it was logged: not used"
-        middle, most = 1e3 * float(np.median(late)), 1e3 * float(late.max())
-        said = f"{self.name} counts from its header.stamp, {middle:.3g} ms before it was logged"
-        return stamp, f"{said} (at most {most:.3g} ms)" if most >= 1 else ""
+            return logged, f"{self.name} has a header.stamp {middle:.4g} s before it was logged: not used"
+        said = f"{self.name} counts from its header.stamp, {1e3 * middle:.3g} ms before it was logged"
+        known = f"{said} (at most {1e3 * most:.3g} ms)" if most >= 1e-3 else ""
+        return np.where(stamped, stamp, logged), known
 
 
 def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
