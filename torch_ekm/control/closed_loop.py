@@ -332,6 +332,7 @@ class ClosedLoop:
         if progress.halt is not None or after.status is PlantStatus.LOST:  # nobody learns from this reading
             seconds += time.perf_counter() - began
             return Step(seen, decision, after, increment, moved, None, seconds, verdict.note)
+        self.knowledge.checkpoint()
         if verdict.encoders:
             self.plant.learn(after)
         progress.halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)

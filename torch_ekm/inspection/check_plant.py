@@ -15,7 +15,7 @@ from ..drivers import Channel, Wiring
 from ..exceptions import EKMError, GraspError
 from ..kinematics import ActuationMap, HandKinematics
 from ..model import KinematicModel
-from ..plant import Observation, Plant, PlantStatus
+from ..plant import Gate, Observation, Plant, PlantStatus
 from ..typing import Array
 from .row import Check
 from .wirings import Mistake, Motion, Readings, WiringTest
@@ -60,6 +60,7 @@ def check_plant(
 class _Checked:
     def __init__(self, plant: Plant, hand: HandDescription, obj: ObjectDescription | None) -> None:
         self.plant, self.hand, self.object = plant, hand, obj
+        self._gate = Gate(plant, hand)
         self.wiring: Wiring | None = getattr(plant, "wiring", None)
         self.free = ActuationMap(hand).free_motion.numpy()
         self.looks: list[Observation] = []
@@ -180,7 +181,7 @@ class _Checked:
         for i, a in enumerate(seen.a.tolist()):
             delta = torch.zeros(self.hand.n_a, dtype=torch.float64)
             delta[i] = self._sign(i, a) * _DEG
-            self.plant.command(delta)
+            self._gate.command(delta, by="check")
         return Check("motors", "warning", "not checked: a dry run moves nothing", "once more, without it")
 
     def _sign(self, i: int, a: float) -> float:
@@ -232,7 +233,7 @@ class _Checked:
         delta = torch.zeros(self.hand.n_a, dtype=torch.float64)
         for step in _STEPS:
             delta[i] = sign * step
-            self.plant.command(delta)
+            self._gate.command(delta, by="check")
             after = self._look()
             a1, q1 = self._mean()
             noise = torch.stack([o.q.double() for o in self._last]).std(0).numpy() * math.sqrt(2 / _LOOKS)
@@ -262,7 +263,7 @@ class _Checked:
             return None, row, pose
         if row is None:
             delta[i] = -motion.a[i]
-            self.plant.command(delta)
+            self._gate.command(delta, by="check")
         return motion, row, pose
 
     def _by_pose(self, i: int, predicted: Array, pose: Array) -> list[Check]:

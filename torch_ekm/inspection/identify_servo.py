@@ -12,6 +12,7 @@ import torch
 from ..drivers import HandDriver
 from ..exceptions import DeviceError
 from ..kinematics import Play, ServoModel
+from ..plant import Gate
 from ..typing import Array
 
 _SIZES = tuple(math.radians(x) for x in (0.4, 0.8, 1.2, 1.6, 2.0))  # one after the other
@@ -68,6 +69,7 @@ def nearest_column(grid: Array, X: Array, y: Array) -> tuple[float, float, float
 
 def _swing(driver: HandDriver, i: int, servo: ServoModel) -> tuple[Array, Array]:
     """Encoder ``(n + 1,)``, sensed joints ``(n + 1, n_h)`` of a motor that swings [rad]; the servo learns."""
+    gate = Gate(driver, driver.hand)
     channel, name, seen = driver.wiring.motors[i], servo.names[i], [driver.observe()]
     only = torch.arange(len(servo.names)) == i
     start, largest = float(seen[0].a[i]), max(_SIZES)
@@ -78,7 +80,7 @@ def _swing(driver: HandDriver, i: int, servo: ServoModel) -> tuple[Array, Array]
     reversals = 0
     for k in range(_MOTIONS):
         v = sign * min(_SIZES[k % len(_SIZES)], driver.limits.increment) * only.double()
-        seen.append(driver.command(v))
+        seen.append(gate.command(v, by="identify-servo"))
         servo.update(v, seen[-1].a - seen[-2].a, only)
         way = first * (float(seen[-1].a[i]) - start)
         if way > _SWING - largest if sign == first else way < largest:

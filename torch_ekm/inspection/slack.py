@@ -15,6 +15,7 @@ from .._files import write_whole
 from ..description._toml import toml_text
 from ..drivers import HandDriver, Wiring
 from ..exceptions import DescriptionError, DeviceError
+from ..plant import Gate
 from .identify_servo import nearest_column
 
 _STEP = math.radians(1)
@@ -81,6 +82,7 @@ def write_zeros(wiring: Wiring, found: list[Taut]) -> None:
 
 def _close(driver: HandDriver, i: int, on_step: Callable[[str], object]) -> tuple[float, float]:
     """Where the tendon of motor i is taut, and its standard deviation [rad]."""
+    gate = Gate(driver, driver.hand)
     motor, limit = driver.wiring.motors[i], driver.limits.increment
     way, problem = [_position_and_load(driver, i)], ""
     delta = torch.zeros(driver.hand.n_a, dtype=torch.float64)
@@ -89,7 +91,7 @@ def _close(driver: HandDriver, i: int, on_step: Callable[[str], object]) -> tupl
         if way[-1][0] > motor.upper - float(delta[i]):
             problem = "closed by all of its range, and its load never rose"
             break
-        driver.command(delta)
+        gate.command(delta, by="slack")
         way.append(_position_and_load(driver, i))
         on_step(f"{motor.name}: {math.degrees(way[-1][0] - way[0][0]):.1f} deg, load {way[-1][1]:.3g}")
         if way[-1][0] - way[-2][0] < _STEP / 4:  # a dead zone, or all that its current can pull
@@ -101,7 +103,7 @@ def _close(driver: HandDriver, i: int, on_step: Callable[[str], object]) -> tupl
     closed = way[-1][0] - way[0][0]
     for _ in range(pieces := math.ceil(closed / limit)):
         delta[i] = -closed / pieces
-        driver.command(delta)
+        gate.command(delta, by="slack")
     a, load = np.array(way).T
     knots = np.linspace(a[0], a[-1], 40 * len(a), endpoint=False)
     at, std, _ = nearest_column(knots, np.maximum(0, a[:, None] - knots), load)

@@ -152,6 +152,7 @@ class ServoModel(Recorded, nn.Module):
         v, w = command.detach().double().numpy(), moved.detach().double().numpy()
         # the buffers' own memory: small torch operations cost ten times as much
         at = SimpleNamespace(**{name: buffer.numpy() for name, buffer in self.named_buffers()})
+        np.clip(at.estimate, -self.largest, self.largest, out=at.estimate)  # as it is used
         went = (abs(w) > self.moved_from) & (True if free is None else free.numpy())
         stood = ~went & (abs(v) > self.resolution) & ~at.stuck & (True if free is None else free.numpy())
         at.failures[went], at.stuck[went] = 0, False
