@@ -33,9 +33,9 @@ class Gate(PlantWrapper):
     a is an encoder reading that was accepted: one outside the range leaves the way back into it. t is the
     plant's own clock; an undated one has no rate. ``v = 0``, to hold, passes always.
 
-    Readings are made :func:`~torch_ekm.plant.readable.readable`, so a plant of eighteen lines is as safe as
-    one of ours. A :class:`~torch_ekm.control.ClosedLoop` puts a gate before its plant, behind the inverse of
-    the servos and the play; put one before a plant that you command yourself::
+    Kind, shape, type, finite numbers, status and clock of each reading are looked at, so a plant of eighteen
+    lines is as safe as one of ours. A :class:`~torch_ekm.control.ClosedLoop` puts a gate before its plant,
+    behind the inverse of the servos and the play; put one before a plant that you command yourself::
 
         plant = Gate(MyHand(), hand)
         plant.command(delta_a)      # CommandRefusedError instead of a motion that is too large
@@ -87,7 +87,7 @@ class Gate(PlantWrapper):
         """Read the sensors.
 
         Raises:
-            EKMError: see :func:`~torch_ekm.plant.readable.readable`.
+            EKMError: the reading is none.
         """
         return self._read(self.plant.observe)
 

@@ -170,10 +170,7 @@ class MixtureResidual(ResidualLearner):
         return self.bounded_slope(self._sum(_finite(means)), slope)
 
     def slope_deviation(self, x: Tensor) -> Tensor:
-        """Of the experts' slopes, within them and between them::
-
-        var = sum_e p_e (h_e^2 var_b + (h_e J_b - J)^2)
-        """
+        """``var = sum_e p_e (h_e^2 var_b + (h_e J_b - J)^2)``, within the experts' slopes and between."""
         x = self.check_query(x)
         J = _finite(torch.stack([learner.linearize(x)[1].to(x.dtype) for learner in self.members], dim=-1))
         s = torch.stack([learner.slope_deviation(x).to(x.dtype) for learner in self.members], dim=-1)

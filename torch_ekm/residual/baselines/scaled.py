@@ -26,8 +26,8 @@ class ScaledLearner(ResidualLearner):
     Units are those of :class:`~torch_ekm.residual.running_scale.RunningScale`. They are adopted after 1, 2,
     4, 8, 16 samples, which are then learned again, and from 32 samples on every 32, by what a subclass does
     in ``_follow``; after a change by a factor of ten the last 31 are learned again. Targets beyond 6 units
-    count as 6: one outlier does not spoil a learner that trusts all samples alike. A learner that is
-    :class:`~torch_ekm.residual.misled.Misled` starts again.
+    count as 6: one outlier does not spoil a learner that trusts all samples alike. A learner that
+    errs by four times y in most of sixteen samples starts again.
 
     A subclass implements f: ``_mean``, ``_law``, ``_slopes``, ``_learn``, ``_clear`` and ``_follow``.
 

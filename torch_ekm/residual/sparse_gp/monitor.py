@@ -91,8 +91,8 @@ class DetectChanges(Part):
         a += ([z2 > 5] - a)/8,   alarm: a > 0.6
 
     A tenth of gross outliers never reaches it; an abrupt change does within eight samples or some more. So do
-    predictions that are much worse than none (:class:`~torch_ekm.residual.misled.Misled`): then the outputs'
-    scales are those of what comes, too.
+    predictions that err by four times y in most of sixteen samples: then the outputs' scales are those of
+    what comes, too.
     The samples since ``a`` last lay below what a single one raises it to are the new system's: the learner
     forgets all and learns these. After an alarm it waits before the next.
 
