@@ -147,6 +147,35 @@ def test_it_goes_dark_when_told_and_sees_after_a_reset(turned) -> None:
     assert dark == [False, True, True]
 
 
+@pytest.mark.parametrize(("field", "place"), [("a", 3), ("q", 5)])
+def test_a_reading_that_guards_refuse_changes_nothing_of_the_estimate(turned, field: str, place: int) -> None:
+    class Glitch(Replay):
+        """The first look after the second motion is wrong; a loop looks again."""
+
+        def command(self, delta_a: torch.Tensor) -> Observation:
+            seen = super().command(delta_a)
+            if self.k != 2:
+                return seen
+            value = getattr(seen, field).clone()
+            value[place] += 0.9
+            return dataclasses.replace(seen, **{field: value})
+
+    hand, made = turned
+    plants = [
+        BlindPose(kind(hand, made, scale=0.0), KinematicModel(hand.hand, hand.object), hand.rotation_axis)
+        for kind in (Replay, Glitch)
+    ]
+    for plant in plants:
+        plant.observe()
+        for _ in range(MOTIONS):
+            plant.command(torch.zeros(hand.hand.n_a, dtype=torch.float64))
+            if plant.plant.k == 2:
+                plant.observe()
+    clean, spoilt = (plant.filter.state for plant in plants)
+    assert float(spoilt.minus(clean)[-6:].abs().max()) < 2e-3  # one look fewer, and no more
+    assert float(clean.minus(made[0].state)[-3:].norm()) > 5 * DEG
+
+
 def test_figures_that_make_no_sense_are_refused(turned) -> None:
     hand, _ = turned
     model = KinematicModel(hand.hand, hand.object)

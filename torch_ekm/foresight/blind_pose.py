@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import torch
 
+from ..control.safety import Guards
+from ..control.safety.readings import ReadingTests
 from ..enhanced import EnhancedModel
 from ..exceptions import ParameterError
 from ..model import KinematicModel
@@ -61,8 +63,10 @@ class BlindPose(PlantWrapper):
         self._switch_off = switch_off
         self.dark, self.looks = False, 0
         """The camera is off; how often it was asked since."""
+        self._tests = ReadingTests(Guards(), self.filter.kinematic.hand)
+        self._sent: Tensor | None = None  # of a motion from which no reading was believed yet
         self._before: Observation | None = None
-        """As measured, last."""
+        """As measured, the last reading that was believed."""
 
     @property
     def axis_std(self) -> float:
@@ -71,26 +75,33 @@ class BlindPose(PlantWrapper):
 
     def reset(self, seed: int) -> Observation:
         """Grasp again with the camera on; the observation after it is that of the plant."""
-        self.dark, self.looks, self._before = False, 0, None
+        self.dark, self.looks, self._before, self._sent = False, 0, None, None
         return super().reset(seed)
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
-        before, after = self._before, self.plant.command(delta_a)
-        if self.dark and before is not None:
-            self.filter.move(after.a - before.a, before.fingertip_force)
+        after = self.plant.command(delta_a)
+        self._sent = delta_a if self._sent is None else self._sent + delta_a
         return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:
-        """``seen``, with the estimated state while the camera is off."""
-        self._before = seen
+        """``seen``, with the estimated state while the camera is off; a reading that :class:`Guards` refuse
+        changes nothing of the estimate."""
+        before, guards = self._before, self._tests.guards
+        believed = self._tests.motors(before, self._sent, seen) is None
         if not self.dark:
+            self._before, self._sent = seen, None
             self.dark = self._switch_off is None or self._switch_off(seen)
             if self.dark:
                 self.filter.start(seen.state, seen.fingertip_force, _covariance(seen))
             return seen
-        self.filter.measure(seen.q, seen.fingertip_force)
-        looked = self.axis_std > self.look_again and seen.status is PlantStatus.HELD
+        if believed:
+            if self._sent is not None and before is not None:
+                self.filter.move(seen.a - before.a, before.fingertip_force)
+            self._before, self._sent = seen, None
+            if float((seen.q - self.filter.state.q).abs().max()) <= guards.joint_jump:
+                self.filter.measure(seen.q, seen.fingertip_force)
+        looked = believed and self.axis_std > self.look_again and seen.status is PlantStatus.HELD
         if looked:
             self.looks += 1
             self.filter.look(seen.state, _covariance(seen))

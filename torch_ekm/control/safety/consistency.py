@@ -39,8 +39,8 @@ _GAP = 2e-3  # [m] rms of the pads' distances from the object, from which they a
 _CLOSES = 0.4  # share of it that an offset leaves, if it is to blame
 
 
-class Test(NamedTuple):
-    """A row of the table: a figure beyond its limit is told and not learned from; ``ends`` motions running
+class Row(NamedTuple):
+    """Of the table: a figure beyond its limit is told and not learned from; ``ends`` motions running
     end the manipulation."""
 
     figure: float
@@ -80,7 +80,7 @@ class Consistency:
         seen: Observation,
         expected: Expectation | None,
         lin: Linearization | None,
-    ) -> tuple[Test | None, Objection | None]:
+    ) -> tuple[Row | None, Objection | None]:
         """The row that objects to a motion, if any; and why the manipulation ends by it, if it does."""
         found, halt = None, None
         for name, test in self._tests(before, sent, seen, expected, lin).items():
@@ -98,11 +98,11 @@ class Consistency:
         seen: Observation,
         expected: Expectation | None,
         lin: Linearization | None,
-    ) -> dict[str, Test]:
+    ) -> dict[str, Row]:
         moved = (seen.a - before.a).where(sent == 0, 0.0)
         i = int(moved.abs().argmax())
         tests = {
-            "drift": Test(
+            "drift": Row(
                 float(moved.abs().max()), _NOWHERE, 3, StopReason.ENCODER_DRIFT,
                 f"encoder '{self.hand.actuator_names[i]}' went {deg(moved[i])} though its motor was sent "
                 f"nowhere (limit {deg(_NOWHERE)}): it drifts, or slips; check its magnet and cable",
@@ -112,7 +112,7 @@ class Consistency:
         if expected is not None and lin is not None:
             described = lin.described_jacobian @ expected.moved
             share, sharp = self.readings.share(before, seen, expected.nominal)
-            tests["sign"] = Test(
+            tests["sign"] = Row(
                 -share * (sharp >= _SHARP), -_AGAINST, 2, StopReason.WRONG_WAY,
                 f"joints and object made {share:.1f} of the motion that the encoders' motion predicts (limit "
                 f"{_AGAINST:g}): a sign of the motors, of their encoders or of the joints is wrong; see "
@@ -121,7 +121,7 @@ class Consistency:
             )  # fmt: skip
             rate, sure = self._drift(before, seen, expected.moved, described)
             i = int(abs(sure).argmax())
-            tests["driven"] = Test(
+            tests["driven"] = Row(
                 float(abs(sure[i]) * (abs(rate[i]) > _DRIFTS)), _SURE, 1, StopReason.ENCODER_DRIFT,
                 f"encoder '{self.hand.actuator_names[i]}' went {deg(rate[i])} more than its joints in each "
                 f"motion, whichever way ({abs(sure[i]):.1f} standard deviations, more where its servo "

@@ -43,14 +43,23 @@ class ReadingTests:
 
     def at_rest(self, seen: Observation, before: Observation | None = None) -> Objection | None:
         """Of a reading without a motion since ``before``."""
-        doubt = self._age(seen) or self._range(seen)
+        doubt = self._age(seen) or self.motors(before, None, seen)
         if before is None or doubt is not None:
             return doubt
         if before.dated and seen.time < before.time:
             message = f"the clock went back from {before.time:.3f} to {seen.time:.3f} s: check the driver"
             return Objection(StopReason.STALE_SENSOR, message)
-        ds, still = seen.state.minus(before.state).numpy(), 0 * seen.a
-        return self._encoders(before, still, seen, self.guards.unchanged) or self._jump(ds, 0 * ds, seen)
+        ds = seen.state.minus(before.state).numpy()
+        return self._jump(ds, 0 * ds, seen)
+
+    def motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> Objection | None:
+        """Ranges, and encoders after the motors were sent by ``sent`` [rad]; None: nowhere."""
+        doubt = self._range(seen)
+        if before is None or doubt is not None:
+            return doubt
+        if sent is None:
+            return self._encoders(before, 0 * seen.a, seen, self.guards.unchanged)
+        return self._encoders(before, sent, seen) or self._against(before, sent, seen)
 
     def after_motion(
         self,
@@ -64,8 +73,7 @@ class ReadingTests:
         without a pose came before."""
         doubt = self._age(seen, before)
         if doubt is None or doubt.blind:  # the camera alone: the rest is still looked at
-            encoders = self._encoders(before, sent, seen) or self._against(before, sent, seen)
-            doubt = self._range(seen) or encoders or self._speed(before, seen) or doubt
+            doubt = self.motors(before, sent, seen) or self._speed(before, seen) or doubt
         if expected is None or (doubt is not None and not doubt.blind):
             return doubt
         ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()

@@ -114,7 +114,7 @@ class Guards:
 
     A reading that breaks one is looked at again (``observe()``), ``looks`` times. If it stands, the loop ends
     with a reason of its own, and what learns (learner, trust region, servo model) is as it was before the
-    motion. Two things are no end: a motion whose pose is unknown is blind, and the model predicts the
+    motion; where a sensor lied for several, before the manipulation. Two things are no end: a motion whose pose is unknown is blind, and the model predicts the
     pose; a fingertip at fault is left out, and the model's estimate stands in.
 
     A change ``z_i`` is gated: ``|z_i - predicted_i| > gate sigma_i`` is no evidence, with::
@@ -158,9 +158,9 @@ class Guards:
     beyond: float = 15 * _DEG
     """Encoders and joints read no more than this outside their ranges [rad]."""
     increment: float = 20 * _DEG
-    """Largest command to an actuator [rad]."""
+    """Largest command to an actuator, as it leaves the :class:`~torch_ekm.plant.Gate` [rad]."""
     speed: float = 3.0
-    """Of an encoder, mean over a motion [rad/s]."""
+    """Of an encoder, mean over a motion; and of commands beyond ``increment`` [rad/s]."""
     stuck_command: float = 4 * _DEG
     """An actuator that stands still in two such commands running is stuck [rad]; so is one that the
     servo model calls so."""
