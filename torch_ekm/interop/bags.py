@@ -10,13 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._extras import require
-from .._files import check_file
 from ..exceptions import DescriptionError, UnknownNameError
 from ..typing import Array
+from .bag_files import check_bag
 
 AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
 
-_LARGEST = 16 << 30  # bytes
 _MOST = 64  # numbers of one field; more is an image or a cloud
 _LEFT_OUT = ("header", "layout")  # stamps and array shapes
 
@@ -49,8 +48,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
         UnknownNameError: there is no such topic; the message lists them.
     """
     path = Path(path)
-    for file in path.iterdir() if path.is_dir() else [path]:
-        check_file(file, "recording", _LARGEST)
+    check_bag(path)
     heard: dict[str, float] = {}
     rows: list[tuple[int, dict[str, float]]] = []
     try:
