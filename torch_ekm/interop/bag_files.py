@@ -30,7 +30,9 @@ def check_bag(path: Path) -> None:
             continue
         with opened(file, "recording", _LARGEST) as content, told_as_damage(file, "recording"):
             if content.read(len(_FIRST[kind])) != _FIRST[kind]:
-                raise DescriptionError(file, f"this recording cannot be read: it does not begin as a '{kind}' does")
+                raise DescriptionError(
+                    file, f"this recording cannot be read: it does not begin as a '{kind}' does"
+                )
             if kind == ".db3":
                 _check_database(file)
             for announced, there in _chunks(content, kind):
