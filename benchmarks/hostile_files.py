@@ -2,7 +2,7 @@
 
     python benchmarks/hostile_files.py
 
-Six hundred files of fourteen kinds: learners, knowledge, trials, logs, CSV, Parquet, recordings of ROS,
+Six hundred files of sixteen kinds: learners, knowledge, trials, logs, CSV, Parquet, recordings of ROS,
 hands, objects, wirings. A quarter is made by hand: pipes, devices, folders, sparse files of 8 GB, headers
 that announce more than there is, endless fields, lines and queries, other encodings. The rest are good files
 with bytes that were changed, cut out, doubled or swapped; most trials with a digest that is right for them.
@@ -38,8 +38,10 @@ import numpy as np
 import pyarrow
 import torch
 from pyarrow import parquet
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from torch_ekm import SparseOnlineGP, load, save
 from torch_ekm.control import HandKnowledge
@@ -52,6 +54,7 @@ from torch_ekm.interop import read_bag
 from torch_ekm.plant import Observation, Trajectory, TrialLog, verify_log
 from torch_ekm.plant.trial_file import FORMAT
 
+_ARRAY = "std_msgs/msg/Float64MultiArray"
 SLOWEST, LARGEST = 10.0, 1 << 30  # [s], bytes
 Make = Callable[[Path], object]
 
@@ -102,16 +105,35 @@ def _parquet(path: Path, **options: Any) -> None:
 
 
 def _bag(path: Path, plugin: StoragePlugin) -> None:
-    store = get_typestore(Stores.LATEST)
-    kind = "std_msgs/msg/Float64MultiArray"
-    layout = store.types["std_msgs/msg/MultiArrayLayout"]([], 0)
-    with Writer(path.parent / "bag", version=9, storage_plugin=plugin) as writer:
-        topic = writer.add_connection("/u", kind, typestore=store)
-        for k, row in enumerate(_rows()):
-            message = store.types[kind](layout, row)
-            writer.write(topic, 10**9 + 10**7 * k, store.serialize_cdr(message, kind))
+    """One file of a recording of ROS 2."""
+    _folder(path.parent / "bag" / "metadata.yaml", plugin)
     (found,) = (path.parent / "bag").glob(f"*{path.suffix}")
     found.rename(path)
+
+
+def _folder(path: Path, plugin: StoragePlugin = StoragePlugin.MCAP) -> None:
+    """A recording of ROS 2, whose list of contents is the file."""
+    with contextlib.suppress(OSError):
+        path.parent.rmdir()
+    with Writer(path.parent, version=9, storage_plugin=plugin) as writer:
+        store = get_typestore(Stores.LATEST)
+        topic = writer.add_connection("/u", _ARRAY, typestore=store)
+        for time, message in _messages(store):
+            writer.write(topic, time, store.serialize_cdr(message, _ARRAY))
+
+
+def _bag_of_ros_1(path: Path) -> None:
+    with Writer1(path) as writer:
+        store = get_typestore(Stores.ROS1_NOETIC)
+        topic = writer.add_connection("/u", _ARRAY, typestore=store)
+        for time, message in _messages(store):
+            writer.write(topic, time, store.serialize_ros1(message, _ARRAY))
+
+
+def _messages(store: Typestore) -> Iterator[tuple[int, object]]:
+    layout = store.types["std_msgs/msg/MultiArrayLayout"]([], 0)
+    for k, row in enumerate(_rows()):
+        yield 10**9 + 10**7 * k, store.types[_ARRAY](layout, row)
 
 
 def _hand(path: Path) -> None:
@@ -275,6 +297,31 @@ TOML = {
     "utf-16": _text("a = 1".encode("utf-16")),
     "latin-1": _text("# größe\na = 1".encode("latin-1")),
 }
+
+
+def _packed(path: Path, plugin: StoragePlugin | None) -> None:
+    """A message of 160 MB of zeros, in some kB."""
+    store = get_typestore(Stores.LATEST if plugin else Stores.ROS1_NOETIC)
+    message = store.types[_ARRAY](store.types["std_msgs/msg/MultiArrayLayout"]([], 0), np.zeros(20_000_000))
+    if plugin is None:
+        writer: Any = Writer1(path)
+        writer.set_compression(Writer1.CompressionFormat.BZ2)
+    else:
+        writer = Writer(path.parent / "bag", version=9, storage_plugin=plugin)
+        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    with writer:
+        pack = store.serialize_cdr if plugin else store.serialize_ros1
+        writer.write(writer.add_connection("/u", _ARRAY, typestore=store), 1, pack(message, _ARRAY))
+    if plugin is not None:
+        (found,) = (path.parent / "bag").glob(f"*{path.suffix}")
+        found.rename(path)
+
+
+YAML = {
+    "laughs": _text("a0: &a0 [1]\n" + "".join(f"a{k + 1}: &a{k + 1} [{f'*a{k},' * 9}]\n" for k in range(12))),
+    "deep": _text("[" * 100_000),
+    "long": _text("a: " + "b" * 10_000_000),
+}
 CSV = {
     "a long field": _text(f"a,b,y\n1,2,{'9' * 60_000_000}\n"),
     "an open quote": _text('a,b,y\n1,2,"' + "3\n" * 30_000_000),
@@ -328,7 +375,7 @@ KINDS = {
         "a.mcap",
         lambda path: _bag(path, StoragePlugin.MCAP),
         lambda path: read_bag(path, "/u"),
-        {"a chunk of 8 GB": _large_chunk},
+        {"a chunk of 8 GB": _large_chunk, "packed": lambda path: _packed(path, StoragePlugin.MCAP)},
     ),
     "db3": Kind(
         "a.db3",
@@ -336,6 +383,13 @@ KINDS = {
         lambda path: read_bag(path, "/u"),
         {"endless": _endless_query},
     ),
+    "bag": Kind(
+        "a.bag",
+        _bag_of_ros_1,
+        lambda path: read_bag(path, "/u"),
+        {"packed": lambda path: _packed(path, None)},
+    ),
+    "rosbag2": Kind("bag/metadata.yaml", _folder, lambda path: read_bag(path.parent, "/u"), YAML),
     "urdf": Kind("hand.urdf", _hand, load_hand, XML),
     "transmission": Kind(
         "hand.transmission.toml", _hand, lambda path: load_hand(path.with_name("hand.urdf")), TOML
@@ -409,10 +463,10 @@ def hostile(folder: Path, number: int, seed: int) -> Iterator[tuple[str, str, Pa
         made = k < min(len(by_hand), number // 3)
         kind, what = by_hand[k] if made else (kinds[k % len(kinds)], "changed")
         here = folder / f"{k}"
-        here.mkdir()
         path = here / KINDS[kind].name
+        path.parent.mkdir(parents=True)
         make = {**PLACES, **KINDS[kind].made}.get(what)
-        if make is None or what in PLACES or what in XML or what in TOML or kind == "log":
+        if make is None or what in PLACES or what in XML or what in TOML or kind in ("log", "rosbag2"):
             KINDS[kind].write(path)  # with what belongs to it
         if make is not None:
             path.unlink(missing_ok=True)
@@ -463,8 +517,10 @@ def _peak() -> int:
 def _work(pipe: Connection) -> None:
     for kind, one in KINDS.items():  # libraries are there before anything is measured
         with tempfile.TemporaryDirectory() as folder:
-            one.write(Path(folder) / one.name)
-            read_one(kind, Path(folder) / one.name)
+            path = Path(folder) / one.name
+            path.parent.mkdir(exist_ok=True)
+            one.write(path)
+            read_one(kind, path)
     pipe.send(None)
     while True:
         pipe.send(read_one(*pipe.recv()))

@@ -13,9 +13,10 @@ from torch_ekm.exceptions import EKMError
 
 def test_what_is_good_can_be_read(tmp_path: Path) -> None:
     for kind, one in hostile_files.KINDS.items():
-        (tmp_path / kind).mkdir()
-        one.write(tmp_path / kind / one.name)
-        assert hostile_files.read_one(kind, tmp_path / kind / one.name).what == "read", kind
+        path = tmp_path / kind / one.name
+        path.parent.mkdir(parents=True)
+        one.write(path)
+        assert hostile_files.read_one(kind, path).what == "read", kind
 
 
 def test_what_is_not_is_refused_at_once(tmp_path: Path) -> None:

@@ -168,22 +168,23 @@ def test_a_damaged_parquet_is_not_read_as_if_whole(tmp_path: Path) -> None:
     columns = pyarrow.table(dict(zip("abcy", values.T, strict=True)))
     parquet.write_table(columns, path, write_page_checksum=True)
     whole, draw, refused = path.read_bytes(), np.random.default_rng(1), 0
+    right = load_table(path)
     for place in draw.integers(4, len(whole) - 4, 80):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << place % 8]) + whole[place + 1 :])
         try:
-            names, read = open_table(path)
-            np.testing.assert_array_equal(read(names), values)
+            found = load_table(path)
         except DescriptionError:
             refused += 1
+        else:
+            torch.testing.assert_close(torch.cat([found.x, found.y], 1), torch.cat([right.x, right.y], 1))
     assert refused > 60
     parquet.write_table(columns, path, compression="none")  # no checksums
     whole = path.read_bytes()
     for value in (1e3, -1e3):
         path.write_bytes(whole.replace(struct.pack("<d", values[7, 1]), struct.pack("<d", value)))
-        names, read = open_table(path)
-        np.testing.assert_array_equal(read("acy"), values[:, [0, 2, 3]])
+        assert torch.equal(load_table(path, inputs=["a", "c"]).x, right.x[:, [0, 2]])
         with pytest.raises(DescriptionError, match="column 'b' does not hold what its statistics say"):
-            read("b")
+            load_table(path)
     lost = whole.replace(b"PAR1", b"PAR0", 1)[: len(whole) // 2]
     path.write_bytes(lost)
     with pytest.raises(DescriptionError, match="no Parquet file"):

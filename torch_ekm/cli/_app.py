@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, ParamSpec, TypeVar
 
 from .._terminal import say  # first: needs the extra
+from .._text import figure
 from .._versions import versions_of
 from ..exceptions import MissingExtraError, ParameterError
 
@@ -96,13 +97,11 @@ def parse_angles(text: str) -> tuple[float, ...]:
         ParameterError: no number, or one that is no rotation.
     """
     valid = "numbers separated by commas, of more than 0 and less than 180 deg, e.g. 10,20"
-    try:
-        angles = tuple(map(float, names(text)))
-    except ValueError:
-        raise ParameterError("angles", text, valid) from None
-    if not angles or not all(0 < abs(angle) < 180 for angle in angles):
+    angles = [figure(word) for word in names(text)]
+    known = tuple(angle for angle in angles if angle is not None and 0 < abs(angle) < 180)
+    if not known or len(known) < len(angles):
         raise ParameterError("angles", text, valid)
-    return angles
+    return known
 
 
 def names(text: str) -> tuple[str, ...]:

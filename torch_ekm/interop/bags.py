@@ -12,15 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .._extras import require
-from .._files import check_file
 from ..exceptions import DescriptionError, UnknownNameError
 from ..typing import Array
+from .bag_files import check_bag
 
 Numbers = NDArray[np.integer[Any]]
 
 AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
 
-_LARGEST = 16 << 30  # bytes
 _MOST = 64  # numbers of one field; more is an image or a cloud
 _LEFT_OUT = ("header", "layout")  # stamps and array shapes
 _HELD = 10  # mean intervals of a column that a value stands for; later the sensor is silent
@@ -64,8 +63,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
         UnknownNameError: there is no such topic; the message lists them.
     """
     path = Path(path)
-    for file in path.iterdir() if path.is_dir() else [path]:
-        check_file(file, "recording", _LARGEST)
+    check_bag(path)
     heard: dict[str, _Topic] = {}
     try:
         reader = AnyReader([path], default_typestore=_typesys.get_typestore(_typesys.Stores.LATEST))
