@@ -67,6 +67,8 @@ class Ros2Plant(HandDriver):
             "std": require("std_msgs.msg"),
         }
         self._master: OneMaster | None = None
+        # by shared memory a process may hear nothing after one before it was killed; users may set another
+        os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
         self._context = rclpy.Context()
         self._context.init(args=[])
         parameters = []
