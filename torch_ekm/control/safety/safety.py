@@ -114,8 +114,9 @@ class Guards:
 
     A reading that breaks one is looked at again (``observe()``), ``looks`` times. If it stands, the loop ends
     with a reason of its own, and what learns (learner, trust region, servo model) is as it was before the
-    motion; where a sensor lied for several, before the manipulation. Two things are no end: a motion whose pose is unknown is blind, and the model predicts the
-    pose; a fingertip at fault is left out, and the model's estimate stands in.
+    motion; where a sensor lied for several, before the manipulation. Two things are no end: a motion whose
+    pose is unknown is blind, and the model predicts the pose; a fingertip at fault is left out, and the
+    model's estimate stands in.
 
     A change ``z_i`` is gated: ``|z_i - predicted_i| > gate sigma_i`` is no evidence, with::
 
