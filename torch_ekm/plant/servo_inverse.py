@@ -6,6 +6,7 @@ from .._checks import check_finite, check_shape
 from ..description import HandDescription
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
+from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .gate import Gate
 from .observation import Observation
@@ -65,7 +66,7 @@ class ServoInverse(PlantWrapper):
 
     def send(self, delta_a: Float[Tensor, " n_a"], start: Observation, by: str) -> Observation:
         """The same from an accepted reading, and nothing is learned; see :meth:`Gate.command`."""
-        delta_a, names = torch.as_tensor(delta_a), self.servo.names
+        (delta_a,), names = as_tensors(delta_a=delta_a), self.servo.names
         check_shape("delta_a", delta_a, (len(names),), f"in order: {', '.join(names)}")
         check_finite("delta_a", delta_a)
         added = (self.servo.command(delta_a) - delta_a).clamp(-self.servo.largest, self.servo.largest)
