@@ -12,7 +12,7 @@ import scipy.stats
 import torch
 from experiments_records import frame, not_grasped, turn
 
-from torch_ekm.exceptions import ParameterError
+from torch_ekm.exceptions import StateError
 from torch_ekm.experiments.protocols.generalize import (
     cell_table,
     ends_table,
@@ -55,10 +55,10 @@ def test_records_come_back_from_json_as_they_were() -> None:
 
 def test_figures_that_a_record_does_not_have_are_refused() -> None:
     figures = turn().to_json()
-    with pytest.raises(ParameterError, match="surprise"):
+    with pytest.raises(StateError, match="surprise"):
         TrialRecord.from_json({**figures, "surprise": 1.0})
     del figures["off_rotation_deg"]
-    with pytest.raises(ParameterError, match="off_rotation_deg"):
+    with pytest.raises(StateError, match="off_rotation_deg"):
         TrialRecord.from_json(figures)
 
 

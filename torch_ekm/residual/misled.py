@@ -37,7 +37,8 @@ class Misled(nn.Module):
         level = self.level
         if mask is None and is_plain(error, y, level):
             e, t, a = error.numpy(), y.numpy(), level.numpy()
-            a += _RATE * ((np.square(e).sum(-1) > _WORSE * np.square(t).sum(-1)) - a)
+            with np.errstate(over="ignore"):  # an infinite square is larger, too
+                a += _RATE * ((np.square(e).sum(-1) > _WORSE * np.square(t).sum(-1)) - a)
             if a.max() <= _ALARM:
                 return None
         else:

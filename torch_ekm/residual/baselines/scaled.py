@@ -167,16 +167,18 @@ class ScaledLearner(ResidualLearner):
         elif (n + 1) % BLOCK == 0:
             changes = self.input.settle(settled=self.settled), self.output.settle(settled=self.settled)
             ratios = torch.cat([changes[0][1], changes[1][1]], dim=-1).log().abs()
-            if bool((ratios > _FAR).any()):  # what was learned so far was of another order
-                self._learn_block(BLOCK - 1)
-            elif bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
+            if bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
                 self._follow(*changes)
+            far = (ratios > _FAR).any(-1)
+            if bool(far.any()):  # what was learned so far was of another order
+                self._learn_block(BLOCK - 1, far)
 
-    def _learn_block(self, n: int) -> None:
-        """Again, from the first n samples of the present block only."""
-        self._clear()
+    def _learn_block(self, n: int, models: Bool[Tensor, "*batch"] | None = None) -> None:
+        """Again, from the first n samples of the present block only; all models, or these."""
+        self._clear(models)
         for i in range(n):
             on = self.input.block_on[..., i, 0] * self.output.block_on[..., i, 0] > 0
+            on = on if models is None else on & models
             if not bool(on.any()):  # nothing, or of a time that is forgotten
                 continue
             x, y = self.input.block[..., i, :], self.output.block[..., i, :]
