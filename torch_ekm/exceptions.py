@@ -440,7 +440,7 @@ class CommandRefusedError(DeviceError):
 
 
 class PlantInUseError(EKMError):
-    """Somebody else commands this plant: one hand has one master.
+    """Another loop or thread commands this plant: one hand has one master.
 
     Attributes:
         plant: its kind.

@@ -10,7 +10,7 @@ from torch import nn
 
 from .._checks import check_shape
 from ..exceptions import NoDerivativeError, ParameterError
-from ..residual.base import recordable, value_and_jacobian
+from ..residual.derivatives import recordable, value_and_jacobian
 from ..typing import Float, Tensor
 from .parameter_filter import FilterReport, ParameterFilter
 

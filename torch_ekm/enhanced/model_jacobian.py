@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from ..exceptions import NoDerivativeError
-from ..residual.base import recordable, value_and_jacobian
+from ..residual.derivatives import recordable, value_and_jacobian
 from ..typing import Float, Tensor
 
 Model = Callable[[Any, Tensor], Tensor]

@@ -62,10 +62,10 @@ class Gate(PlantWrapper):
 
     @contextlib.contextmanager
     def owned(self) -> Iterator[None]:
-        """Nobody else commands the plant meanwhile, by whatever wrappers.
+        """No other one commands the plant meanwhile, by whatever wrappers.
 
         Raises:
-            PlantInUseError: somebody does so already.
+            PlantInUseError: another one does so already.
         """
         plant = _innermost(self.plant)
         with _OWNING:
@@ -103,7 +103,7 @@ class Gate(PlantWrapper):
         Raises:
             CommandRefusedError: nothing was sent; the error says what was asked, by whom, and what
                 is allowed.
-            PlantInUseError: somebody else commands this plant.
+            PlantInUseError: another one commands this plant.
         """
         owner = _OWNERS.get(id(_innermost(self.plant)))
         with contextlib.nullcontext() if owner is self else self.owned():

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
-import os
 import pathlib
 import pickle
 import threading
-import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -22,43 +19,12 @@ from .._checks import check_count, check_counts, check_finite
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError, StateError
 from ..typing import Bool, Float, Tensor
+from . import processes
+from .derivatives import recordable, value_and_jacobian
 from .report import UpdateReport
 
 #: times the largest |y| that was learned, beyond which no prediction goes
 FARTHEST = 2.0
-
-
-_alive: weakref.WeakSet[ResidualLearner] = weakref.WeakSet()
-_held: list[ResidualLearner] = []
-_PATIENCE = 5.0  # for an update under way [s]
-
-
-def _before_fork() -> None:
-    """No update is under way: a child has only the thread that forked, so it would stay half done there."""
-    _held.extend(learner for learner in list(_alive) if learner.lock.acquire(timeout=_PATIENCE))
-
-
-def _in_parent() -> None:
-    while _held:
-        _held.pop().lock.release()
-
-
-def _in_child() -> None:
-    _held.clear()
-    for learner in _alive:
-        learner.lock = threading.RLock()
-    if len(_alive):  # torch's own threads do not exist here
-        torch.set_num_threads(1)
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(before=_before_fork, after_in_parent=_in_parent, after_in_child=_in_child)
-
-
-def _unpickled(kind: type[ResidualLearner], state: bytes) -> ResidualLearner:
-    made = kind.__new__(kind)
-    made.__setstate__(pickle.loads(state))
-    return made
 
 
 class ResidualLearner(Recorded, nn.Module, ABC):
@@ -111,7 +77,7 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         self.on_invalid = on_invalid
         self.n_refused = nn.Buffer(torch.zeros(self.batch_shape, dtype=torch.int64, device=device))
         self.lock = threading.RLock()
-        _alive.add(self)
+        processes.track(self)
         # An empty float tensor follows .to() and so remembers dtype and device for all subclasses.
         self._like = nn.Buffer(torch.empty(0, dtype=dtype, device=device), persistent=False)
         shape = (*self.batch_shape, self.out_features)
@@ -281,11 +247,11 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
         self.lock = threading.RLock()
-        _alive.add(self)
+        processes.track(self)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy in another process, too: torch would share a tensor's memory with it."""
-        return _unpickled, (type(self), pickle.dumps(self.__getstate__()))
+        return processes.unpickled, (type(self), pickle.dumps(self.__getstate__()))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ResidualLearner:
         made = memo[id(self)] = type(self).__new__(type(self))
@@ -425,36 +391,3 @@ class SingleLearner(ResidualLearner):
         if mask is not None and not bool(mask):
             return UpdateReport.of_nothing(mask, self.dtype)
         return super().step(x, y, None)
-
-
-def recordable(x: Any) -> Any:
-    """Outside of inference mode its tensors as ones that autograd takes, also within tuples, lists and dicts;
-    all else as it is."""
-    if type(x) is dict:
-        return {name: recordable(value) for name, value in x.items()}
-    if type(x) in (tuple, list):
-        return type(x)(map(recordable, x))
-    if isinstance(x, tuple) and hasattr(x, "_fields"):
-        return type(x)(*map(recordable, x))
-    if isinstance(x, Tensor) and x.is_inference() and not torch.is_inference_mode_enabled():
-        return x.clone()
-    return x
-
-
-def value_and_jacobian(
-    f: Callable[[Tensor], Tensor], x: Float[Tensor, "*any in"]
-) -> tuple[Float[Tensor, "*any out"], Float[Tensor, "*any out in"] | None]:
-    """``(f(x), df/dx)`` by autograd, under ``no_grad`` and in inference mode too; entries of a batch must not
-    depend on each other. None: f carries no derivative."""
-    with torch.inference_mode(False), torch.enable_grad():
-        at = x.detach().clone().requires_grad_(True)
-        value = f(at)
-        if not value.requires_grad:
-            return value, None
-        rows = [  # one backward pass per output
-            torch.autograd.grad(one.sum(), at, retain_graph=True, materialize_grads=True)[0]
-            if one.requires_grad
-            else torch.zeros_like(at)
-            for one in value.unbind(-1)
-        ]
-    return value.detach(), torch.stack(rows, dim=-2)
