@@ -168,7 +168,7 @@ class ClosedLoop:
         with self._gate.owned():
             self._stop.clear()
             self._gate.last = self._gate.failure = None
-            known, guards = self.learned.state(), self.safety.guards
+            known, guards = {} if self._rehearses else self.learned.state(), self.safety.guards
             try:
                 model, servo, rule = self.controller.kinematic, self.knowledge.servo, self.safety.rule
                 watch = Watch(guards, model, self._expect, rule.tolerance, servo)
@@ -332,7 +332,8 @@ class ClosedLoop:
         if progress.halt is not None or after.status is PlantStatus.LOST:  # nobody learns from this reading
             seconds += time.perf_counter() - began
             return Step(seen, decision, after, increment, moved, None, seconds, verdict.note)
-        self.knowledge.checkpoint()
+        if not self._rehearses:
+            self.knowledge.checkpoint()
         if verdict.encoders:
             self.plant.learn(after)
         progress.halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)

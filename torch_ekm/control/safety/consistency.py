@@ -148,9 +148,8 @@ class Consistency:
             left = ee - 2 * alpha * we - 2 * beta * e + alpha**2 * ww + 2 * alpha * beta * w + beta**2 * n
             std = np.sqrt(variance * a / det)
             variance = (_GUESS * _REST_STD**2 + left) / (_GUESS + np.maximum(n - 2, 0))
-        judged = (n >= _FEWEST) & (
-            ww > n * _DRIFTS**2
-        )  # joints may be bent by other motors where this one stands
+        # joints may be bent by other motors where this one stands
+        judged = (n >= _FEWEST) & (ww > n * _DRIFTS**2)
         bias = self.servo.bias.numpy()
         surer = np.where((abs(bias) > _BIAS) & (bias * beta > 0), _BOTH, 1.0)
         return beta, np.where(judged, surer * beta / std, 0.0)

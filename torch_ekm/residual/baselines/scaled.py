@@ -147,8 +147,8 @@ class ScaledLearner(ResidualLearner):
             self._observe(x, y, mask)
         self.n_samples += 1
         z = self._inputs(x)
-        error = y - self._value(self._mean(z))
-        misled = self.misled.observe(error, y if not self.standardize else y - self.output.shift, mask)
+        t = self.output(y) if self.standardize else y
+        misled = self.misled.observe(t - self._mean(z), t, mask)
         if misled is not None:
             self._clear(misled)
             if self.standardize:

@@ -29,7 +29,7 @@ class Standardize(Part):
         output_offset: ``"zero"``: g is 0 far from all samples, as a model's residual needs it;
             ``"learned"``: the mean of y.
         input_resolution: size of changes of x that mean something, one number or one per input; 0: not known.
-            An input that only jitters below it is none: its slope is 0.
+            An input that only jitters below it hardly counts.
         output_scale: size of y that matters, one number or one per output; 0: not known.
 
     Raises:
