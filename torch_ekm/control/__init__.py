@@ -5,18 +5,21 @@ from __future__ import annotations
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
-from .decision import Decision, StopReason
+from .bands import Band, Bands
+from .decision import Decision, Piece, StopReason
 from .focus import Direction, FocusedPose, PoseTarget
 from .force_sensitivity import ForceSensitivity
 from .journal import Journal
 from .knowledge import HandKnowledge
+from .limiting import LimitingFunction, StepBound
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .manipulation import Manipulation, Step, Stop
 from .model_hand import ModelHand
-from .pace import LimitingFunction, Pace, PaceOptions, StepBound, TrustRegion
 from .qp import Bounds, Equality, Inequality, Squares
-from .reach import Reach, Reachability, ReachEnd
-from .safety import Caution, Guards, Safety, StoppingRule
+from .plan import OneStep, Plan, Planner, Waypoint, WholeTurn
+from .reach import Reach, Reachability
+from .rehearsal import End, PathEnd
+from .safety import Guards, Safety, StoppingRule
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 
@@ -24,13 +27,15 @@ __all__ = [
     "DEFAULT_LIMITS",
     "DEFAULT_TASKS",
     "ActuatorLimit",
+    "Band",
+    "Bands",
     "Bounds",
-    "Caution",
     "ClosedLoop",
     "Decision",
     "Direction",
     "DescribedFigures",
     "EffortTask",
+    "End",
     "Equality",
     "FocusTask",
     "FocusedPose",
@@ -50,12 +55,13 @@ __all__ = [
     "ModelHand",
     "NormalForceLimit",
     "OffAxisTask",
-    "Pace",
-    "PaceOptions",
+    "OneStep",
+    "PathEnd",
+    "Plan",
+    "Planner",
     "PoseTarget",
     "Reach",
     "Reachability",
-    "ReachEnd",
     "Safety",
     "Situation",
     "Squares",
@@ -65,5 +71,6 @@ __all__ = [
     "StopReason",
     "StoppingRule",
     "Task",
-    "TrustRegion",
+    "Waypoint",
+    "WholeTurn",
 ]

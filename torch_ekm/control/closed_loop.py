@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
-import dataclasses
 import math
 import threading
 import time
@@ -15,33 +13,39 @@ import torch
 from .._checks import check_kind
 from .._extras import require
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
-from ..model import Linearization
+from ..exceptions import StateError
 from ..plant import Gate, Observation, Plant, PlantStatus, ServoInverse
-from ..residual import UpdateReport
+from ..plant.frames_at_rest import mean_reading
 from ..residual.sparse_gp.engine.loading import load_loops
-from ..typing import Tensor
 from .controller import LookAndMoveController
-from .decision import Decision, Expectation, StopReason
+from .decision import Decision, StopReason
+from .ends import Ends, hindrances
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
 from .learned import Learned
+from .lessons import felt, learn, learn_forces
 from .manipulation import Manipulation, Step, Stop
-from .pace import SLIDES, ForceSurprise
-from .reach import Reach, Reachability, follow_to_the_end, out_of_reach, reachability
+from .plan import OneStep, Plan, Planner, WholeTurn
+from .model_error import NOISE
+from .reach import Reach, Reachability, out_of_reach, reach, reachability
 from .safety import Safety
-from .safety.progress import Progress
+from .safety.safety import Objection
 from .safety.watch import Watch
 
-_KNOWN = 15  # motions from which the figures of a hand are learned
-_GRIP_SHARE = 0.5  # of a motion that only grips: too little for the pace to grow
+_DEG = math.pi / 180
+_GRIPS = 3  # movements that only grip, before the first turn
+_FULL, _LEAST = 0.9, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
+_SLIP = 0.5  # [N] by which the grip is tightened where the object moved otherwise than predicted:
+_SLIPS, _SHARE = 2.0, 0.15  # deviations from which it is thought to slide, of a model that errs by this share
 
 
 class ClosedLoop:
-    """observe, decide, command, learn, until :class:`Safety` ends it.
+    """Look, plan, move, learn, until the target is seen to be reached, or no way on is safe.
 
-    ``steps`` is a generator of motions; metrics and pictures are its consumers::
+    ``steps`` is a generator of movements; metrics and pictures are its consumers::
 
         with ClosedLoop(plant, controller) as loop:
+            print(loop.plan(target))
             for step in loop.steps(target):
                 print(step.increment)
 
@@ -54,14 +58,14 @@ class ClosedLoop:
 
     Args:
         plant: with a grasped object (already reset).
-        controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after every motion.
+        controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after every movement.
         knowledge: of the hand, on which the loop goes on learning; None: nothing is known yet, and nothing is
             learned of the servos if the controller's model is no enhanced one.
-        safety: when it looks again, goes back, stops and gives up.
+        safety: when it looks again and stops.
+        planner: decides on the movements; None: :class:`WholeTurn` of an enhanced model, else
+            :class:`OneStep`.
         learn: False leaves the learner as it is.
-        decline: a target out of :meth:`reachability` ends as out of reach before anything moves. So does,
-            once an enhanced model has found the hand's figures in 15 motions, a turn of 25 deg or more
-            that is 5 deg beyond :meth:`reach`, or another target of 4 steps that the model misses.
+        decline: a target out of :meth:`reachability` ends as out of reach before anything moves.
 
     Raises:
         ParameterError: no controller.
@@ -75,6 +79,7 @@ class ClosedLoop:
         *,
         knowledge: HandKnowledge | None = None,
         safety: Safety | None = None,
+        planner: Planner | None = None,
         learn: bool = True,
         decline: bool = True,
     ) -> None:
@@ -88,13 +93,14 @@ class ClosedLoop:
         controller.forces = None if controller.enhanced is None else knowledge.forces
         self._figures = DescribedFigures() if controller.enhanced is None else knowledge.figures
         self.controller, self.learn, self.decline = controller, learn, decline
+        self.planner = planner or (OneStep() if controller.enhanced is None else WholeTurn())
         self.safety = Safety() if safety is None else safety
         guards = self.safety.guards
         self._gate = Gate(plant, hand, increment=guards.increment, speed=guards.speed)
         self.plant, self.knowledge = ServoInverse(self._gate, hand, knowledge.servo), knowledge
         self.learned = Learned(knowledge, controller)
-        self._stop, self._rehearses = threading.Event(), False
-        require("qpsolvers")  # now, not within the first motion; so with the learner's loops
+        self._stop = threading.Event()
+        require("qpsolvers")  # now, not within the first movement; so with the learner's loops
         if learn and controller.enhanced is not None:
             load_loops()
 
@@ -117,9 +123,19 @@ class ClosedLoop:
         with contextlib.suppress(Exception):
             self._gate.command(torch.zeros(self.controller.kinematic.hand.n_a), by="hold")
 
+    def plan(self, target: PoseTarget) -> Plan:
+        """The path to ``target`` from here, how sure the model is of it, and how far it is safe. ::
+
+            print(loop.plan(target))
+
+        Nothing moves, and nothing is learned.
+        """
+        planner = self.planner if isinstance(self.planner, WholeTurn) else WholeTurn()
+        return planner.plan(self.controller, self.plant.observe(), target, self.knowledge, 0.0, whole=True)
+
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
-        """``max |angle|`` of this loop on a :class:`ModelHand`: its programs, limits, pace and signs of a
-        loss, with f + g in place of the plant, without noise. Nothing moves, and nothing is learned. ::
+        """``max |angle|`` of a :meth:`plan` about the focused axis: how far the model turns the object, and
+        what ends it. Nothing moves, and nothing is learned. ::
 
             reach = loop.reach()
             loop.run(PoseTarget.turned(plant.observe().state, axis, reach.safe))
@@ -132,7 +148,7 @@ class ClosedLoop:
             ParameterError: no single rotation in focus, a sign that is none, an angle outside 0 to 170 deg.
             GraspError: the model refuses the grasp as it is.
         """
-        return follow_to_the_end(self._rehearsal, self.controller, self.plant.observe(), sign, limit)
+        return reach(self.controller, self.knowledge, self.plant.observe(), sign, limit)
 
     def reachability(self, target: PoseTarget) -> Reachability:
         """Whether the motors can bring the object to ``target``: rank and conditioning of the focused rows of
@@ -141,44 +157,35 @@ class ClosedLoop:
         Raises:
             GraspError: the model refuses the grasp as it is.
         """
-        return reachability(self.controller, self.safety.caution, self.plant.observe(), target)
-
-    def _rehearsal(self, hand: Plant, target: PoseTarget) -> Generator[Step, None, Stop]:
-        """On a hand that does what was learned and has no play; the pace alone adapts."""
-        controller = copy.copy(self.controller)
-        controller.pace = copy.deepcopy(controller.pace)
-        known = HandKnowledge.of(controller.kinematic.hand, learns=False, adapts=False)
-        known.figures, known.forces = self.knowledge.figures, copy.deepcopy(self.knowledge.forces)
-        loop = ClosedLoop(hand, controller, knowledge=known, safety=self.safety, learn=False, decline=False)
-        loop._figures, loop._rehearses = DescribedFigures(), True
-        return loop.steps(target)
+        return reachability(self.controller, self.plant.observe(), target)
 
     def run(self, target: PoseTarget) -> Manipulation:
         """Drive the object to ``target``.
 
         Raises:
             PlantInUseError: another loop, or this one in another thread, commands the plant.
+            StateError: another loop has given the controller other knowledge.
             EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises before there is a
                 reading.
         """
         return Manipulation.of(target, self.controller.focus, self.steps(target))
 
     def steps(self, target: PoseTarget) -> Generator[Step, None, Stop]:
-        """The motions one by one; the generator's return value is the :class:`Stop`."""
+        """The movements one by one; the generator's return value is the :class:`Stop`."""
+        controller = self.controller
+        if controller.enhanced is not None and controller.kinematic.figures is not self.knowledge.figures:
+            raise StateError("another loop has given this controller other knowledge: make one for each loop")
         with self._gate.owned():
             self._stop.clear()
             self._gate.last = self._gate.failure = None
-            known, guards = {} if self._rehearses else self.learned.state(), self.safety.guards
+            known = self.learned.state()
             try:
-                model, servo, rule = self.controller.kinematic, self.knowledge.servo, self.safety.rule
-                watch = Watch(guards, model, self._expect, rule.tolerance, servo)
-                stop = yield from self._motions(target, watch)
+                watch = Watch(self.safety.guards, controller.kinematic, self.safety.rule.tolerance,
+                              self.knowledge.servo)  # fmt: skip
+                stop = yield from self._movements(target, watch)
                 if watch.lie:
                     self.learned.restore(known)
                     stop = stop.told(watch.lie)
-                if self.learn and self.controller.pace.adapts:
-                    reached = stop.reason is StopReason.REACHED
-                    self.knowledge.pace.fill_(self.controller.pace.factor * reached)
                 return stop
             except (Exception, KeyboardInterrupt) as error:
                 last, failure = self._gate.last, self._gate.failure
@@ -190,210 +197,145 @@ class ClosedLoop:
                 self.hold()
                 raise
 
-    def _motions(self, target: PoseTarget, watch: Watch) -> Generator[Step, None, Stop]:
-        model = self.controller.kinematic
+    def _movements(self, target: PoseTarget, watch: Watch) -> Generator[Step, None, Stop]:
+        """Look, plan, move, learn."""
         first = watch.first(self.plant.observe(), self.plant.observe)
-        seen = first.seen
+        seen, halt = first.seen, first.halt
         self.controller.reset()
         self.knowledge.forces.begin()
         self._figures.begin(seen.a)
-        progress = Progress(self.safety, target, self.controller.focus, seen, self._rehearses)
-        progress.halt = first.halt
-        known = self.controller.enhanced is not None and int(self.knowledge.figures.count) >= _KNOWN
-        if self.decline and progress.halt is None and seen.status is not PlantStatus.LOST:
-            rehearsal = self._rehearsal if known else None
-            against = out_of_reach(rehearsal, self.controller, self.safety.caution, seen, target)
-            if against:
-                return Stop(StopReason.OUT_OF_REACH, seen, against)
-        self.controller.pace.begin(float(self.knowledge.pace) if known and self.learn else 0.0)
-        if progress.halt is None and seen.status is PlantStatus.HELD:
-            seen, weak = yield from self._grip_first(seen, progress, watch)
-            watch.grip.forget()
-            if weak and progress.halt is None and not progress.lost(seen):
-                return Stop(StopReason.WEAK_GRASP, seen, weak)
+        ends = Ends(self.safety.rule, target, self.controller.focus, seen)
+        grips = turns = 0
         decision = None
         while True:
-            over = progress.over(seen, self._stop.is_set())
+            if halt is not None:
+                self.hold()
+                return Stop(halt.reason, seen, halt.message)
+            seen, looks = self._look(seen, ends, watch)
+            over = ends.over(seen, looks)
             if over is not None:
-                if progress.halt is not None:
-                    self.hold()
-                elif over.reason is StopReason.STALLED:
-                    over = over._replace(message=progress.hindrances(seen, decision, model))
-                    seen = yield from self._return_to_best(seen, decision, progress, watch)
-                return Stop(over.reason, seen, over.message)
-            seen, decision, sign, seconds = self._decide(seen, progress, watch)
-            if sign and progress.way and decision.status is not StopReason.OBJECT_LOST:
-                progress.alarms += 1
-                watch.forget()
-                seen, clear = yield from self._go_back(seen, decision, progress, watch)
-                if progress.halt is not None:
-                    continue
-                if progress.lost(seen):
-                    return Stop(StopReason.OBJECT_LOST, seen, sign)
-                if not clear or progress.alarms > self.safety.caution.retreats:
-                    return Stop(StopReason.GIVEN_UP, seen, sign + progress.surprise + watch.suspects(seen))
-                self.controller.tighter += self.safety.caution.tighten
-                self.controller.pace.restart()
-                continue
-            if decision.status is not StopReason.RUNNING:
-                suspects = progress.surprise + watch.suspects(seen)
-                return Stop(decision.status, seen, decision.message + suspects)
-            progress.halt = watch.command(decision, seen)
-            if progress.halt is not None:
-                continue
-            step = self._move(seen, decision, progress, watch, seconds)
-            progress.come(step.after, step.pull)
-            yield step
-            seen, progress.limited = step.after, decision.limited
-
-    def _grip_first(
-        self, seen: Observation, progress: Progress, watch: Watch
-    ) -> Generator[Step, None, tuple[Observation, str]]:
-        """Tighten a grip in which a finger bears less than the object needs; what still does, in words."""
-        left = self.safety.caution.grips
-        while not self._stop.is_set():
-            here = PoseTarget(seen.position, seen.rotation)
-            decision = self.controller.decide(seen.state, seen.a, here, seen.fingertip_force)
-            weak = watch.grip.weak(decision) if decision.status is StopReason.RUNNING else ""
-            if not weak or left == 0:  # an estimate is no reason to decline
-                return seen, weak if seen.fingertip_force is not None else ""
-            decision = dataclasses.replace(decision, share=_GRIP_SHARE)
-            progress.halt = watch.command(decision, seen)
-            if progress.halt is not None:
-                return seen, weak
-            step = self._move(seen, decision, progress, watch, turns=False)
-            yield step
-            seen, left = step.after, left - 1
-            if seen.status is PlantStatus.LOST or progress.halt is not None:
-                return seen, weak
-        return seen, ""
-
-    def _decide(
-        self, seen: Observation, progress: Progress, watch: Watch
-    ) -> tuple[Observation, Decision, str, float]:
-        """A decision, and what speaks for a loss to come in this reading and in all further looks."""
-        looks = self.safety.caution.looks
-        while True:
+                why = over.message
+                if over.reason is StopReason.STALLED:
+                    why = hindrances(seen, decision, self.controller.kinematic)
+                return Stop(over.reason, seen, why)
+            if self._stop.is_set():
+                return Stop(StopReason.STOPPED, seen)
+            if self.decline and decision is None and seen.status is PlantStatus.HELD:
+                against = out_of_reach(self.controller, seen, target)
+                if against:
+                    return Stop(StopReason.OUT_OF_REACH, seen, against)
             began = time.perf_counter()
-            target = progress.belief.target(seen)
-            decision = self.controller.decide(seen.state, seen.a, target, seen.fingertip_force)
-            seconds = time.perf_counter() - began
-            sign = progress.sign(seen, decision)
-            if not sign or looks == 0 or seen.status is not PlantStatus.HELD:
-                return seen, decision, sign or watch.slid or watch.grip.sign, seconds
-            seen, looks = watch.rest(seen, self.plant.observe()), looks - 1
-
-    def _go_back(
-        self, seen: Observation, decision: Decision, progress: Progress, watch: Watch
-    ) -> Generator[Step, None, tuple[Observation, bool]]:
-        """Undo the last motions until nothing speaks for a loss; False: it still does."""
-        for _ in range(min(self.safety.caution.way_back, len(progress.way))):
-            back = -progress.way.pop()
-            step = self._move(seen, self.controller.retreat(decision, back), progress, watch)
+            firm = 0.0 if grips >= _GRIPS else _LEAST if turns else _FULL
+            plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
+            seconds, decision = time.perf_counter() - began, plan.decision
+            if decision.status is not StopReason.RUNNING:
+                more = ends.surprise + watch.suspects(seen)
+                return Stop(decision.status, seen, "; ".join(filter(None, (decision.message, plan.end.message))) + more)
+            weak = "" if turns or firm else watch.weak(decision, seen)
+            if weak:
+                return Stop(StopReason.WEAK_GRASP, seen, weak)
+            halt = watch.command(decision, seen)
+            if halt is not None:
+                continue
+            step, halt = self._move(seen, decision, ends, watch, seconds)
             yield step
-            before, seen = seen, step.after
-            if seen.status is PlantStatus.LOST or progress.halt is not None:
+            seen, grips, turns = step.after, grips + (not decision.turns), turns + decision.turns
+
+    def _look(self, seen: Observation, ends: Ends, watch: Watch) -> tuple[Observation, int]:
+        """The mean of as many readings at rest as it takes to see whether the target is reached, and how many
+        these are."""
+        rule, readings, mean = self.safety.rule, [seen], seen
+        while mean.status is PlantStatus.HELD and len(readings) < rule.most_looks:
+            n, error = len(readings), ends.error(mean)
+            doubt = watch.readings.pose_noise(seen, self.controller.focus) / math.sqrt(n)
+            if error > rule.tolerance + 3 * doubt or (n >= rule.looks and abs(error - rule.tolerance) > doubt):
                 break
-            seen, decision, sign, _ = self._decide(seen, progress, watch)
-            if not sign or progress.stays_off(before, seen):
-                return seen, not sign
-        return seen, False
-
-    def _return_to_best(
-        self, seen: Observation, decision: Decision | None, progress: Progress, watch: Watch
-    ) -> Generator[Step, None, Observation]:
-        """Undo the motions that led away from where the object was nearest to its target, if that helps."""
-        began = seen
-        while decision is not None and progress.strayed(seen, began) and progress.halt is None:
-            back = self.controller.retreat(decision, -progress.way.pop())
-            step = self._move(seen, back, progress, watch)
-            yield step
-            seen = step.after
-        return seen
+            another = watch.rest(seen, self.plant.observe())
+            if another is seen:
+                break
+            readings.append(another)
+            mean = mean_reading(readings)
+        return mean, len(readings)
 
     def _move(
-        self,
-        seen: Observation,
-        decision: Decision,
-        progress: Progress,
-        watch: Watch,
-        seconds: float = 0.0,
-        turns: bool = True,
-    ) -> Step:
-        """Command, observe, learn."""
-        by = "grip" if not turns else "turn" if decision.share > 0 else "retreat"
-        most = decision.delta_a.abs().clamp(min=self.safety.guards.increment)  # play makes no command large
-        motors = self._figures.motors(decision.delta_a).clamp(-most, most)
-        first = self.plant.send(motors, seen, by)
+        self, seen: Observation, decision: Decision, ends: Ends, watch: Watch, seconds: float
+    ) -> tuple[Step, Objection | None]:
+        """Command, observe, learn; why the manipulation must end here, if it must."""
+        first = self._command(seen, decision)
         began = time.perf_counter()
-        verdict = watch.motion(seen, decision, self.plant.sent, first, self.plant.observe)
-        after, progress.halt = verdict.seen, verdict.halt
+        expect = lambda moved: self.controller.expect(decision.pieces, self._figures.pulled(moved))
+        verdict = watch.motion(seen, decision, self.plant.sent, first, expect, self.plant.observe)
+        after, halt, expected = verdict.seen, verdict.halt, verdict.expected
         increment, moved = after.state.minus(seen.state), after.a - seen.a
-        if progress.halt is not None or after.status is PlantStatus.LOST:  # nobody learns from this reading
+        if halt is not None or after.status is PlantStatus.LOST:  # nobody learns from this reading
             seconds += time.perf_counter() - began
-            return Step(seen, decision, after, increment, moved, None, seconds, verdict.note)
-        if not self._rehearses:
-            self.knowledge.checkpoint()
+            return Step(seen, decision, after, increment, moved, None, seconds, verdict.note), halt
+        self.knowledge.checkpoint()
         if verdict.encoders:
             self.plant.learn(after)
-        progress.halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
-        report, lin, expected = None, decision.linearization, verdict.expected
-        if lin is not None and expected is not None and after.status is PlantStatus.HELD:
-            felt = watch.grip.surprise(lin, seen, expected.moved, after)
-            # what a guard objects to may be a faulty pad
-            fades = decision.share > 0 and not verdict.note and watch.grip.follow(decision, felt)
-            if verdict.teaches and progress.halt is None and (self.learn or self._rehearses):
-                report = self._learn(seen, decision, lin, moved, increment, expected, felt, fades)
-            if turns and decision.share > 0 and self.controller.enhanced is not None:
-                # moved otherwise than predicted, it slides, or turns out of the grip
-                slides = self._disagreement(lin, increment, expected) > SLIDES
-                self.controller.tighter += slides * self.safety.caution.slip
+        halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
+        report = None
+        if expected is not None and after.status is PlantStatus.HELD:
+            report = self._learn(seen, decision, after, moved, verdict, halt is None)
+        self.controller.previous = self._forces_there(seen, decision)
         pull = self._figures.commit(moved, after.a)
-        progress.belief.see(after, None if self.controller.enhanced is None else expected)
         seconds += time.perf_counter() - began
-        if turns:
-            progress.add(after, blind=watch.blind > 0)
+        if decision.turns:
+            ends.add(after, decision.limited)
             if watch.gated and expected is not None and not (watch.blind or watch.slid):
                 off = torch.linalg.vector_norm((increment - expected.increment)[-3:])
-                progress.leapt(float(off), verdict.note)
-            if progress.halt is None:
-                progress.halt = watch.way(progress.errors, decision, moved)
-        return Step(seen, decision, after, increment, pull, report, seconds, verdict.note)
+                ends.leapt(float(off), verdict.note)
+            halt = halt or watch.way(ends.errors, decision, moved)
+        return Step(seen, decision, after, increment, pull, report, seconds, verdict.note), halt
 
-    def _expect(self, lin: Linearization, moved: Tensor) -> Expectation:
-        """Of what the motors did, less what the play took up."""
-        return self.controller.expect(lin, self._figures.pulled(moved))
+    def _command(self, seen: Observation, decision: Decision) -> Observation:
+        """Move the motors through the pieces; the reading at rest."""
+        by, way = "turn" if decision.turns else "grip", torch.zeros_like(decision.delta_a)
+        most, after, sent = self.safety.guards.increment, seen, torch.zeros_like(way)
+        goals = []
+        for one in decision.pieces:
+            way = way + one.action
+            goals.append(self._figures.motors(way))
+        last = torch.zeros_like(way)
+        for k, goal in enumerate(goals):
+            end = k == len(goals) - 1
+            if not end and float((goals[k + 1] - last).abs().max()) <= most:
+                continue
+            step = goal - last
+            after = self.plant.send(step.clamp(-most, most), after, by)
+            sent, last = sent + self.plant.sent, goal
+        self.plant.sent, self.plant._start = sent, seen.a
+        return after
 
     def _learn(
-        self,
-        seen: Observation,
-        decision: Decision,
-        lin: Linearization,
-        moved: Tensor,
-        ds: Tensor,
-        expected: Expectation,
-        felt: ForceSurprise | None,
-        fades: bool,
-    ) -> UpdateReport | None:
-        if (enhanced := self.controller.enhanced) is None:
+        self, seen: Observation, decision: Decision, after: Observation, moved, verdict, goes_on: bool
+    ):
+        """What a movement teaches, and whether the object slides."""
+        controller, knowledge, expected = self.controller, self.knowledge, verdict.expected
+        if controller.enhanced is None:
             return None
-        if not self.knowledge.servo.learns:  # then the dead zones are g's to learn
+        if not knowledge.servo.learns:  # then the dead zones are g's to learn
             moved = decision.delta_a
-            expected = self._expect(lin, moved)
-        rho = math.inf if fades else self._disagreement(lin, ds, expected, felt)
-        self.controller.pace.judge(rho, decision.share)
-        if not self.learn:
+            expected = controller.expect(decision.pieces, self._figures.pulled(moved))
+        increment = after.state.minus(seen.state)
+        if decision.turns:
+            off = float(torch.linalg.vector_norm((increment - expected.increment)[-3:]))
+            way = float(torch.linalg.vector_norm(expected.increment[-3:]))
+            if off > _SLIPS * (2**0.5 * NOISE + _SHARE * way):
+                controller.tighter += _SLIP
+            if self.learn:
+                knowledge.error.see(off, way)
+        if not (verdict.teaches and goes_on and self.learn):
             return None
-        if felt is not None:
-            self.knowledge.forces.learn(lin, expected.moved, felt)
-        self._figures.learn(lin, moved, ds)
-        pull = self._figures.pulled(moved)
-        nominal = self.controller.kinematic.followed(lin).step(pull)  # g learns what they leave
-        return enhanced.update(seen.state, pull, ds, nominal)
+        least = controller.kinematic.options.forces.normal_std
+        surprise = felt(controller.kinematic.hand, least, expected, seen, after)
+        if surprise is not None:
+            learn_forces(controller.kinematic.hand, knowledge, expected, surprise)
+        return learn(controller, self._figures, expected, moved, increment)
 
-    def _disagreement(
-        self, lin: Linearization, ds: Tensor, expected: Expectation, felt: ForceSurprise | None = None
-    ) -> float:
-        """rho of a motion, see :class:`~torch_ekm.control.TrustRegion`."""
-        trust = self.controller.pace.options.trust
-        return trust.disagreement(expected.increment[-6:], ds[-6:], float(lin.lever), felt)
+    def _forces_there(self, seen: Observation, decision: Decision):
+        """The last linearization on the way, for the forces that go on from it."""
+        last = decision.pieces[-1]
+        if not last.linearization.forces.solved:
+            return self.controller.previous
+        return last.linearization, seen.a + decision.delta_a - last.action

@@ -16,10 +16,10 @@ from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, S
 from ..kinematics import GraspState
 from ..model import KinematicModel, ModelStatus
 from ..typing import Float, Tensor
-from .decision import Decision, Expectation, Grip, StopReason
+from .decision import Decision, Expectation, Grip, Piece, StopReason
 from .focus import A_TARGET, FocusedPose, PoseTarget
+from .limiting import LimitingFunction, StepBound, contact_travel
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
-from .pace import Pace, contact_travel
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
@@ -49,7 +49,7 @@ class LookAndMoveController:
     At each step it solves (section III.B of the E-KM paper, made feasible)::
 
         min_da  sum of the tasks' squares and of rho |sl|_1
-        s.t.    M_c E_p (f + g)(s, da) + sl = dx_d,    dx_d = e min(gain, step/|e|, c/|v(e)|)
+        s.t.    M_c E_p (f + g)(s, da) + sl = phi dx_d,    dx_d = e min(gain, step/|e|, c/|v(e)|)
                 the limits
 
     With ``g`` the program is nonlinear and is solved by a damped SQP on ``J_m + dg/da``:
@@ -63,7 +63,8 @@ class LookAndMoveController:
         focus: what of the pose must be reached, or the axis about which the object is to be turned.
         tasks: what a step should do (:class:`Task`); None: :data:`DEFAULT_TASKS`.
         limits: what it must not do (:class:`Limit`); None: :data:`DEFAULT_LIMITS`.
-        pace: how far a step goes; None: a new :class:`Pace`, which adapts if the model is an enhanced one.
+        limiting: how much of the error a single step asks for.
+        bound: phi, how much of that is made; None: all of it.
 
     Raises:
         ParameterError: no kinematic model, or a task or limit without a method ``rows``.
@@ -75,7 +76,9 @@ class LookAndMoveController:
         focus: FocusedPose | Float[Tensor, " 3"],
         tasks: Sequence[Task] | None = None,
         limits: Sequence[Limit] | None = None,
-        pace: Pace | None = None,
+        *,
+        limiting: LimitingFunction | None = None,
+        bound: StepBound | None = StepBound(),
     ) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         check_kind(
@@ -86,7 +89,7 @@ class LookAndMoveController:
         self.limits = (
             DEFAULT_LIMITS if limits is None else tuple(check_kind("limits", limits, Sequence, _LIST))
         )
-        self.pace = Pace(adapts=self.enhanced is not None) if pace is None else pace
+        self.limiting, self.bound = LimitingFunction() if limiting is None else limiting, bound
         self.forces: ForceSensitivity | None = None
         """What was learned of how the pads' forces answer; a :class:`ClosedLoop` sets it."""
         self.tighter = 0.0
@@ -94,8 +97,11 @@ class LookAndMoveController:
         for part in (*self.tasks, *self.limits):
             if isinstance(part, type) or not callable(getattr(part, "rows", None)):
                 raise ParameterError("tasks, limits", part, _LIST)
+        self._wanted = next((one.wanted for one in self.tasks if hasattr(one, "wanted")), None)
+        self._least = next((one.least for one in self.limits if hasattr(one, "least")), None)
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
-        self._previous: tuple[Linearization, Tensor] | None = None
+        self.previous: tuple[Linearization, Tensor] | None = None
+        """The last linearization of this grasp whose forces were found, and the encoders there."""
 
     def follow(self, figures: FollowedFigures) -> None:
         """Let f of the enhanced model follow the figures of the hand as they are learned."""
@@ -105,30 +111,60 @@ class LookAndMoveController:
     def reset(self) -> None:
         """Forget the contact forces and the tighter grip of the last grasp; a :class:`ClosedLoop` does so
         when it begins."""
-        self._previous, self.tighter = None, 0.0
+        self.previous, self.tighter = None, 0.0
 
-    def expect(self, lin: Linearization, moved: Float[Tensor, " n_a"]) -> Expectation:
-        """``(f + g)(s, w)`` of what the encoders did from a linearized state, and how sure g is of it."""
-        nominal = lin.step(moved)
-        if self.enhanced is None:
-            return Expectation(moved, nominal, nominal, torch.zeros_like(nominal))
-        g, variance = self.enhanced.correction(lin.state, moved, len(nominal))
-        return Expectation(moved, nominal, nominal + g, variance.sqrt())
+    def expect(self, pieces: Sequence[Piece], moved: Float[Tensor, " n_a"]) -> Expectation:
+        """``(f + g)(s, w)`` of what the tendons did in place of the pieces, and how sure g is of it.
 
-    def _linearize(self, state: GraspState, a: Tensor, fingertip_force: Tensor | None) -> Linearization:
-        """The kinematic model with the forces that the fingertips and the last forces speak for."""
+        What they did otherwise is spread over the pieces as their ways are.
+        """
+        way = torch.stack([one.action.norm() for one in pieces])
+        share = way / way.sum() if bool(way.any()) else way + 1 / len(pieces)
+        extra = moved - sum(one.action for one in pieces)
+        start = f = both = pieces[0].state
+        deviation, made, last = torch.zeros_like(pieces[0].nominal), [], pieces[-1]
+        for one, part in zip(pieces, (share[:, None] * extra).unbind(), strict=True):
+            w, g = one.action + part, torch.zeros_like(one.nominal)
+            nominal = one.nominal + one.linearization.manipulation_jacobian @ part
+            if self.enhanced is not None:
+                g, variance = self.enhanced.correction(one.state, w, len(nominal))
+                deviation = deviation + variance.sqrt()  # g errs alike along a path
+            f, both = f.plus(nominal), both.plus(nominal + g)
+            made.append(Piece(one.linearization, w, nominal, nominal + g, one.force))
+        nominal, increment = made[0].nominal, made[0].increment
+        if len(made) > 1:
+            nominal, increment = f.minus(start), both.minus(start)
+        normal = None if last.force is None else last.force.clone()
+        if normal is not None:
+            rows, pads = self.kinematic.hand.pad_rows(last.linearization.contacts.finger)
+            normal[pads] += (last.linearization.normal_force_sensitivity @ extra)[rows]
+        return Expectation(moved, nominal, increment, deviation, tuple(made), normal)
+
+    def linearize(
+        self,
+        state: GraspState,
+        a: Float[Tensor, " n_a"],
+        fingertip_force: Float[Tensor, " n_pads"] | None,
+        previous: tuple[Linearization, Tensor] | None = None,
+    ) -> Linearization:
+        """The kinematic model with the forces that fingertips and ``previous`` forces, at other encoders,
+        speak for.
+
+        Raises:
+            GraspError: the model refuses the grasp as it is.
+        """
         last, expected = None, None
-        if self._previous is not None:
-            last, then = self._previous
+        if previous is not None:
+            last, then = previous
             expected = last.forces_after(a - then)
         lin = self.kinematic.linearize(
             state, fingertip_force=fingertip_force, expected=expected, previous=last
         )
         if self.forces is not None:
-            pads = self.kinematic.hand.pad_indices(lin.contacts.finger)
-            lin = lin.with_normal_sensitivity(self.forces.corrected(lin.normal_force_sensitivity, pads))
-        if lin.forces.solved:
-            self._previous = lin, a
+            rows, pads = self.kinematic.hand.pad_rows(lin.contacts.finger)
+            corrected = lin.normal_force_sensitivity.clone()
+            corrected[rows] = self.forces.corrected(corrected[rows], pads)
+            lin = lin.with_normal_sensitivity(corrected)
         return lin
 
     def _joint_force(self, lin: Linearization) -> Tensor | None:
@@ -141,17 +177,6 @@ class LookAndMoveController:
             return None
         return forces.normal if forces.solved else None
 
-    def retreat(self, at: Decision, delta_a: Float[Tensor, " n_a"]) -> Decision:
-        """The decision to undo a motion, instead of the one that was taken ``at`` the state."""
-        lin, still = at.linearization, at.predicted.new_zeros(at.predicted.shape)
-        predicted, nominal = still, still
-        if lin is not None:
-            predicted, nominal = self.expect(lin, delta_a).increment, lin.described_jacobian @ delta_a
-        desired = self.focus.matrix @ predicted[-6:]
-        return Decision(
-            delta_a, StopReason.RUNNING, desired, predicted, nominal, share=0.0, linearization=lin
-        )
-
     def decide(
         self,
         state: GraspState,
@@ -159,7 +184,7 @@ class LookAndMoveController:
         target: PoseTarget,
         fingertip_force: Float[Tensor, " n_pads"] | None = None,
     ) -> Decision:
-        """Choose the next increment.
+        """Choose the next increment: one step of the paper's loop.
 
         Args:
             state: measured joint angles and object pose.
@@ -177,93 +202,131 @@ class LookAndMoveController:
             ShapeError: an observation has the wrong size.
             EKMError: what the tasks and limits raise.
         """
+        force = self.believed(a, fingertip_force)
+        error = self._error(state, target)
+        focused = self.focus.matrix @ error
+        try:
+            lin = self.linearize(state, a, force, self.previous)
+        except NoContactError as failure:
+            if self.previous is not None or force is None:
+                return self.none(StopReason.OBJECT_LOST, failure, focused)
+            held = NoContactError(f"{failure}; but pads measure forces: check the object's size and pose")
+            return self.none(StopReason.UNSTABLE_GRASP, held, focused)
+        except GraspError as failure:
+            return self.none(StopReason.UNSTABLE_GRASP, failure, focused)
+        if lin.forces.solved:
+            self.previous = lin, a
+        travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
+        scale = self.focus.step_scale
+        desired = self.limiting(scale * focused, travel) / scale
+        seen = self.situation(lin, a, force, error, desired)
+        decision = self.choose(lin, seen)
+        if self.bound is None or decision.status is not StopReason.RUNNING:
+            return decision
+        asked = self.limiting.steps(scale * desired, travel * float(desired.norm() / focused.norm().clamp(1e-12)))
+        phi = self.bound.share(lin, decision.delta_a, decision.predicted, seen, asked)
+        return decision if phi == 1 else self.choose(lin, dataclasses.replace(seen, desired=phi * desired))
+
+    def believed(self, a: Tensor, fingertip_force: Tensor | None) -> Tensor | None:
+        """The fingertips' forces, NaN where a pad may be dead; None: no pad measures.
+
+        Raises:
+            NonFiniteError, ShapeError: see :meth:`decide`.
+        """
         hand = self.kinematic.hand
         check_shape("a", a, (hand.n_a,))
         check_finite("a", a)
-        if fingertip_force is not None:
-            check_shape("fingertip_force", fingertip_force, (len(hand.pads),))
-            check_finite("fingertip_force", fingertip_force)
-            least = self.kinematic.options.forces.normal_std
-            fingertip_force = fingertip_force.where(fingertip_force.abs() >= least, torch.nan)
-            if bool(fingertip_force.isnan().all()):
-                fingertip_force = None
+        if fingertip_force is None:
+            return None
+        check_shape("fingertip_force", fingertip_force, (len(hand.pads),))
+        check_finite("fingertip_force", fingertip_force)
+        least = self.kinematic.options.forces.normal_std
+        force = fingertip_force.where(fingertip_force.abs() >= least, torch.nan)
+        return None if bool(force.isnan().all()) else force
+
+    def _error(self, state: GraspState, target: PoseTarget) -> Tensor:
+        """e, the twist to the target."""
         error = check_kind("target", target, PoseTarget, A_TARGET).error(state)
         check_shape("target", error, (6,))
         check_finite("target", error)
-        focused = self.focus.matrix @ error
-        try:
-            lin = self._linearize(state, a, fingertip_force)
-        except NoContactError as failure:
-            if self._previous is not None or fingertip_force is None:
-                return self._none(StopReason.OBJECT_LOST, failure, focused)
-            held = NoContactError(f"{failure}; but pads measure forces: check the object's size and pose")
-            return self._none(StopReason.UNSTABLE_GRASP, held, focused)
-        except GraspError as failure:
-            return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
+        return error
 
-        travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
-        desired, share = self._ask(focused, travel, fingertip_force is not None)
-        alone = None if fingertip_force is None else self._joint_force(lin)
+    def situation(
+        self,
+        lin: Linearization,
+        a: Float[Tensor, " n_a"],
+        force: Float[Tensor, " n_pads"] | None,
+        error: Float[Tensor, " 6"],
+        desired: Float[Tensor, " n_x"],
+    ) -> Situation:
+        """What the rows of tasks and limits are made from.
+
+        Args:
+            force: as :meth:`believed` [N].
+            error: e.
+            desired: dx_d.
+        """
+        hand = self.kinematic.hand
+        alone = None if force is None else self._joint_force(lin)
         seen = Situation(
-            hand, self.focus, state, a, fingertip_force, error, desired, alone, self._weight, self.tighter
+            hand, self.focus, lin.state, a, force, error, desired, alone, self._weight, self.tighter
         )
         if self.forces is not None:
-            drift = self.forces.drift[hand.pad_indices(lin.contacts.finger)]
-            seen = dataclasses.replace(seen, drift=as_array(drift))
-        grips = (task.wanted(lin, seen) for task in self.tasks if isinstance(task, GripForceTask))
-        seen = dataclasses.replace(seen, grip=next(grips, None))
-        try:
-            start = LinearizedModel.about(a.new_zeros(hand.n_a), lin, self.enhanced)
-            da, predicted, problem, solution = self._solve(lin, seen, start)
-            phi = self.pace.cut(lin, da, predicted, seen, share)
-            if phi < 1:
-                desired, share = phi * desired, phi * share
-                seen = dataclasses.replace(seen, desired=desired)
-                da, predicted, problem, solution = self._solve(lin, seen, start)
-        except SolverError as failure:  # it cannot be infeasible, as all rows have slack
-            return self._none(StopReason.UNSTABLE_GRASP, failure, focused)
-        nominal = lin.described_jacobian @ da
-        slack = float(np.abs(solution.slack).max(initial=0.0))
-        asked = float((self.focus.tolerance_scale * desired).abs().max())
-        limited = slack > 0.05 * asked and self._at_limit(a, da, problem)
-        grip = self._grip(lin, seen)
-        return Decision(
-            da, StopReason.RUNNING, desired, predicted, nominal, share, limited, slack, lin, grip=grip
-        )
+            rows, pads = hand.pad_rows(lin.contacts.finger)
+            drift = np.zeros(len(lin.contacts.finger))
+            drift[rows] = as_array(self.forces.drift[pads])
+            seen = dataclasses.replace(seen, drift=drift)
+        return seen if self._wanted is None else dataclasses.replace(seen, grip=self._wanted(lin, seen))
 
-    def _grip(self, lin: Linearization, seen: Situation) -> Grip | None:
+    def choose(self, lin: Linearization, seen: Situation) -> Decision:
+        """The best increment for a dx_d."""
+        try:
+            da, predicted, problem, solution = self._solve(lin, seen)
+        except SolverError as failure:  # it cannot be infeasible, as all rows have slack
+            return self.none(StopReason.UNSTABLE_GRASP, failure, seen.desired)
+        slack = float(np.abs(solution.slack).max(initial=0.0))
+        asked = float((self.focus.tolerance_scale * seen.desired).abs().max())
+        limited = slack > 0.05 * asked and self._at_limit(seen.a, da, problem)
+        piece = Piece(lin, da, lin.step(da), predicted, self._force_after(lin, seen, da))
+        return Decision(
+            da, StopReason.RUNNING, seen.desired, predicted, lin.described_jacobian @ da, (piece,), limited,
+            slack, grip=self.grip(lin, seen),
+        )  # fmt: skip
+
+    def _force_after(self, lin: Linearization, seen: Situation, da: Tensor) -> Tensor | None:
+        """Normal force of each pad after an increment [N], NaN of one that does not touch; None: unknown."""
+        f_n = seen.normal_force(lin)
+        if f_n is None:
+            return None
+        rows, pads = seen.hand.pad_rows(lin.contacts.finger)
+        force = da.new_full((len(seen.hand.pads),), torch.nan)
+        force[pads] = (torch.from_numpy(f_n) + lin.normal_force_sensitivity @ da)[rows]
+        return force
+
+    def grip(self, lin: Linearization, seen: Situation) -> Grip | None:
         """What the fingers bear and should bear; None where nothing is known or asked of it."""
         f_n = seen.normal_force(lin)
-        least = next((limit for limit in self.limits if isinstance(limit, NormalForceLimit)), None)
-        if f_n is None or least is None:
+        if f_n is None or self._least is None:
             return None
-        force, needed = torch.from_numpy(f_n), torch.from_numpy(least.least(f_n, seen))
-        std = torch.zeros_like(force)
-        if self.forces is not None:
-            std = self.forces.variance.sqrt()[seen.hand.pad_indices(lin.contacts.finger)]
-        return Grip(force, needed, std, seen.grip or 0.0)
+        f_n = f_n[seen.pads(lin)]
+        force, needed = torch.from_numpy(f_n), torch.from_numpy(self._least(f_n, seen))
+        return Grip(force, needed, seen.grip or 0.0)
 
-    def _none(self, status: StopReason, failure: EKMError, focused: Tensor) -> Decision:
+    def none(self, status: StopReason, failure: EKMError, desired: Tensor) -> Decision:
         """No motion, and why."""
         hand = self.kinematic.hand
-        zero, still = focused.new_zeros(hand.n_a), focused.new_zeros(hand.n_q + 6)
-        return Decision(zero, status, self._ask(focused)[0], still, still, message=str(failure))
-
-    def _ask(self, focused: Tensor, travel: float = 0.0, measures: bool = True) -> tuple[Tensor, float]:
-        """dx_d and its share of the largest step; the pace counts in turns."""
-        scale = self.focus.step_scale
-        desired, share = self.pace.ask(scale * focused, travel, measures)
-        return desired / scale, share
+        zero, still = desired.new_zeros(hand.n_a), desired.new_zeros(hand.n_q + 6)
+        return Decision(zero, status, desired, still, still, message=str(failure))
 
     def _solve(
-        self, lin: Linearization, seen: Situation, start: LinearizedModel
+        self, lin: Linearization, seen: Situation
     ) -> tuple[Tensor, Tensor, ControlProblem, ControlSolution]:
         """The best increment, what the model predicts of it, and the last program with its solution."""
-        enhanced, da, model = self.enhanced, seen.a.new_zeros(len(seen.a)), start
+        enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
         linear = enhanced is None or enhanced.affine
-        for iteration in range(1 if linear else _ITERATIONS):
-            if iteration:
-                model = LinearizedModel.about(da, lin, enhanced)
+        while_far = range(1 if linear else _ITERATIONS)
+        for _ in while_far:
+            model = LinearizedModel.about(da, lin, enhanced)
             problem = build_qp(len(da), [part.rows(model, seen) for part in (*self.tasks, *self.limits)])
             solution = problem.solve()
             best = torch.as_tensor(solution.u, dtype=da.dtype)

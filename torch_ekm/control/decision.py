@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
 
+import torch
+
+from ..kinematics import GraspState
 from ..typing import Float, Tensor
 
 if TYPE_CHECKING:
@@ -22,9 +25,9 @@ class StopReason(Enum):
     ACTUATOR_LIMITS = "actuator limits"
     UNSTABLE_GRASP = "unstable grasp"
     GIVEN_UP = "given up"
-    """With the object in the hand, see :class:`~torch_ekm.control.Caution`."""
+    """With the object in the hand: no way on is safe, see :class:`~torch_ekm.control.Plan`."""
     WEAK_GRASP = "weak grasp"
-    """Declined before anything turned: a finger bears less than the object needs, and grips no better."""
+    """A finger bears less than the object needs, and grips no better."""
     OUT_OF_REACH = "out of reach"
     """Declined before anything moved, see ``decline`` of :class:`~torch_ekm.control.ClosedLoop`."""
     OBJECT_LOST = "object lost"
@@ -57,48 +60,86 @@ class Grip(NamedTuple):
     """f_n, as measured, or as estimated where a pad does not measure [N]."""
     least: Float[Tensor, " n_c"]
     """What each should bear at least, see :class:`~torch_ekm.control.NormalForceLimit` [N]."""
-    std: Float[Tensor, " n_c"]
-    """How far predictions of it are off [N]; 0 where it is unknown."""
     wanted: float
     """Of the finger that opposes the others, see :class:`~torch_ekm.control.GripForceTask` [N]; 0: none."""
+
+    @property
+    def weak(self) -> bool:
+        """Some finger bears less than it should."""
+        return bool((self.force < self.least).any())
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A short part of a movement, for which one linearization holds."""
+
+    linearization: Linearization
+    """The kinematic model where it begins."""
+    action: Float[Tensor, " n_a"]
+    """w, of the tendons [rad]."""
+    nominal: Float[Tensor, " n_s"]
+    """f(s, w) [rad, m, rad]."""
+    increment: Float[Tensor, " n_s"]
+    """(f + g)(s, w) [rad, m, rad]."""
+    force: Float[Tensor, " n_pads"] | None = None
+    """Normal forces after it [N]; None: not predicted."""
+
+    @property
+    def state(self) -> GraspState:
+        """Where it begins."""
+        return self.linearization.state
 
 
 @dataclass(frozen=True)
 class Decision:
-    """The motion that the controller chose, what it predicts, and with which uncertainty."""
+    """The movement that was chosen, what is predicted of it, and with which uncertainty."""
 
     delta_a: Float[Tensor, " n_a"]
-    """Increment to command, relative to the encoders [rad]."""
+    """What the tendons shall do, from the first piece to the last [rad]."""
     status: StopReason
     """RUNNING, or why no increment can be given."""
     desired: Float[Tensor, " n_x"]
-    """dx_d, the limited error of the focused pose [rad, m]."""
+    """dx_d, what it shall do to the focused pose [rad, m]."""
     predicted: Float[Tensor, " n_s"]
-    """(f + g)(s, da)."""
+    """By f + g."""
     nominal: Float[Tensor, " n_s"]
-    """J_m da of the hand as described: what the kinematic model alone predicts."""
-    share: float = 1.0
-    """Of the largest step that the pace allows."""
+    """By the hand as described: what the kinematic model alone predicts."""
+    pieces: tuple[Piece, ...] = ()
+    """In their order."""
     limited: bool = False
-    """The step could not be met in full because actuators stand at their limits."""
+    """What was asked for could not be met in full because actuators stand at their limits."""
     slack: float = 0.0
-    """Largest focused error that the step leaves unmet, as a turn [rad]."""
-    linearization: Linearization | None = None
-    """The kinematic model at the state; None where it has none."""
+    """Largest focused error that a step leaves unmet, as a turn [rad]."""
     message: str = ""
     """Why there is no increment."""
     grip: Grip | None = None
     """None: no forces are known, or no :class:`~torch_ekm.control.NormalForceLimit` asks for any."""
+    turns: bool = True
+    """Else it only grips."""
+
+    @property
+    def linearization(self) -> Linearization | None:
+        """The kinematic model where the movement begins; None where it has none."""
+        return self.pieces[0].linearization if self.pieces else None
 
 
 class Expectation(NamedTuple):
-    """What f + g predict of a motion that the encoders made."""
+    """What f + g predict of a movement that the encoders made."""
 
     moved: Float[Tensor, " n_a"]
-    """w, of the encoders [rad]."""
+    """w, of the tendons [rad]."""
     nominal: Float[Tensor, " n_s"]
-    """f(s, w) = J_m w [rad, m, rad]."""
+    """By f [rad, m, rad]."""
     increment: Float[Tensor, " n_s"]
-    """(f + g)(s, w) [rad, m, rad]."""
+    """By f + g [rad, m, rad]."""
     deviation: Float[Tensor, " n_s"]
-    """Standard deviation of g(s, w) [rad, m, rad]; 0 where nothing is learned."""
+    """Standard deviation of g [rad, m, rad]; 0 where nothing is learned."""
+    pieces: tuple[Piece, ...]
+    """As they were made."""
+    normal: Float[Tensor, " n_pads"] | None
+    """Force of each pad after it [N]; NaN of one that does not touch; None: unknown."""
+
+    @property
+    def described(self) -> Float[Tensor, " n_s"]:
+        """By the hand as described, to first order [rad, m, rad]."""
+        return torch.stack([one.linearization.described_jacobian @ one.action for one in self.pieces]).sum(0)

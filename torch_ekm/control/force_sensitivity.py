@@ -84,18 +84,22 @@ class ForceSensitivity(Recorded, nn.Module):
         at = list(pads)
         return self.scale[at, None] * described + self.correction[at]
 
+    def spread(self, moved: Float[Tensor, " n_a"], said: Float[Tensor, " n_pads"]) -> Float[Tensor, " n_pads"]:
+        """``sqrt(u' P u + s^2)``: standard deviation of what is predicted for the change of each force [N].
+
+        Args:
+            moved: w [rad].
+            said: S w, the change by the model alone [N].
+        """
+        along = np.tile(_PRIOR_STD * moved.numpy(), (len(self.theta), 1))
+        u = np.concatenate([said.numpy()[:, None], along], axis=-1)
+        variance = self.variance.numpy()
+        doubt = (_gain(self.evidence.numpy(), variance, u) * u).sum(-1)
+        return torch.from_numpy(np.sqrt(variance + doubt))
+
     def begin(self) -> None:
         """A new grasp: nothing drifts yet."""
         self.drift.zero_()
-
-    def learn(self, lin: Linearization, moved: Float[Tensor, " n_a"], felt: ForceSurprise) -> None:
-        """Pads that touched and measured before and after a motion teach how their forces answer."""
-        pads = list(felt.pads)
-        change = torch.full((len(self.theta),), torch.nan, dtype=torch.float64)
-        change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
-        described = torch.zeros_like(self.correction)
-        described[pads] = lin.described_normal_sensitivity
-        self.update(moved, change, described)
 
     @torch.no_grad()
     def update(

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from .._files import write_whole
-from .._recorded import Recorded, bound_problems, check_state, describe, make
+from .._recorded import Recorded, check_state, describe, make
 from ..description import HandDescription
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import EKMError, FileFormatError, ParameterError, StateError
@@ -22,15 +22,16 @@ from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
 from ..typing import Tensor
 from .force_sensitivity import ForceSensitivity
-from .pace import LARGEST
+from .model_error import ModelError
 
-Part = Literal["servo", "forces", "figures", "pace"]
+Part = Literal["servo", "forces", "figures", "error"]
 _KEPT = 8  # motions whose lessons can be taken back
 
 
 class HandKnowledge(Recorded, nn.Module):
     """What a closed loop has learned of its hand, for any object: dead zones and biases of the servos, how
-    the forces of the fingers answer to them, the figures by which it moves an object, and its last pace.
+    the forces of the fingers answer to them, the figures by which it moves an object, and how far motions end
+    from their prediction.
 
     Hand it to the next loop with the same hand, and keep it between sessions::
 
@@ -53,8 +54,8 @@ class HandKnowledge(Recorded, nn.Module):
     ) -> None:
         super().__init__()
         self.servo, self.forces, self.figures = servo, forces, figures
-        self.pace = nn.Buffer(torch.tensor(0.0, dtype=torch.float64))
-        """p at the end of the last turn, if that reached its target; else 0."""
+        self.error = ModelError()
+        """Share of a motion by which it ends elsewhere than predicted."""
         self._before: deque[dict[str, Tensor]] = deque(maxlen=_KEPT)  # states before the last motions
 
     @classmethod
@@ -111,10 +112,6 @@ class HandKnowledge(Recorded, nn.Module):
         self._before.clear()
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
-    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
-        """What is wrong with the entries of a state that is to be loaded; each part looks at its own."""
-        return bound_problems(state, pace=(0, LARGEST))
-
     def reset(self, part: Part) -> None:
         """Nothing is known of this part any more.
 
@@ -123,11 +120,8 @@ class HandKnowledge(Recorded, nn.Module):
         """
         if part not in get_args(Part):
             raise ParameterError("part", part, f"one of {', '.join(get_args(Part))}")
-        if part == "pace":
-            self.pace.zero_()
-        else:
-            held = getattr(self, part)
-            held.load_state_dict(make(describe(held), known_classes()).state_dict())
+        held = getattr(self, part)
+        held.load_state_dict(make(describe(held), known_classes()).state_dict())
 
     def save(self, path: str | os.PathLike) -> None:
         """Write all of it; the file appears whole or not at all. The one that it replaces is kept beside, if

@@ -15,15 +15,15 @@ from .knowledge import HandKnowledge
 
 
 class Learned:
-    """Knowledge of the hand, pace, learner; a learner without a state of its own is left out.
+    """Knowledge of the hand and learner; a learner without a state of its own is left out.
 
     Args:
         knowledge: of the hand.
-        controller: has the other two.
+        controller: has the learner.
     """
 
     def __init__(self, knowledge: HandKnowledge, controller: LookAndMoveController) -> None:
-        self._parts: dict[str, nn.Module] = {"knowledge": knowledge, "pace": controller.pace}
+        self._parts: dict[str, nn.Module] = {"knowledge": knowledge}
         if controller.enhanced is not None:
             self._parts["learner"] = controller.enhanced.learner
 

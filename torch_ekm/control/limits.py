@@ -115,12 +115,14 @@ class NormalForceLimit:
         f_n, forces = seen.normal_force(model.kinematic), model.kinematic.forces
         if f_n is None:
             return None
+        pads = seen.pads(model.kinematic)
         most = np.maximum(f_n, as_array(forces.normal)) if forces.solved else f_n
         most = most if seen.joint_force is None else np.maximum(most, as_array(seen.joint_force))
+        f_n, most, drift = f_n[pads], most[pads], seen.drift_of(pads)
         high = np.minimum(np.maximum(self.maximum - f_n, -self.step), np.maximum(self.maximum - most, 0.0))
         low = np.minimum(np.minimum(self.least(f_n, seen) - f_n, self.step), high)
-        S = as_array(model.kinematic.normal_force_sensitivity)
-        return Inequality(np.concatenate([-S, S]), np.concatenate([seen.drift - low, high - seen.drift]))
+        S = as_array(model.kinematic.normal_force_sensitivity)[pads]
+        return Inequality(np.concatenate([-S, S]), np.concatenate([drift - low, high - drift]))
 
     def least(self, f_n: Array, seen: Situation) -> Array:
         """least_i of each contact ``(n_c,)`` [N]."""

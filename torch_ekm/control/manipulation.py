@@ -32,11 +32,6 @@ class Step:
     note: str = ""
     """What a guard objects to in this motion, see :class:`~torch_ekm.control.Guards`."""
 
-    @property
-    def retreat(self) -> bool:
-        """The motion undid an earlier one."""
-        return self.decision.share == 0.0
-
 
 class Stop(NamedTuple):
     """Why a manipulation ended, and what was seen last."""

@@ -10,7 +10,7 @@ import torch
 
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..exceptions import GraspError
+from ..exceptions import GraspEndsError, GraspError
 from ..kinematics import GraspState
 from ..model import ContactMotion, KinematicModel, Linearization
 from ..plant import Observation, PlantStatus
@@ -34,8 +34,8 @@ class ModelHand:
         forces: how the pads' forces answer, as learned; None: as the model says.
     """
 
-    failure: str
-    """Why the grasp ends, after which the object counts as lost; empty: it holds."""
+    failure: GraspError | None
+    """Why the grasp ends, after which the object counts as lost; None: it holds."""
 
     def __init__(
         self,
@@ -56,10 +56,12 @@ class ModelHand:
     def reset(self, seed: int) -> Observation:
         """Back to where it began; there is no noise to be seeded."""
         self.state, self.a, force = self._start
-        self.time, self.failure = 0.0, ""
+        self.time, self.failure = 0.0, None
         self._motion: ContactMotion | None = None
         self._linearization: Linearization | None = None
         self._way = self.a.new_zeros(self.hand.n_a)
+        self.increment = self.correction = self.a.new_zeros(self.state.n_s)
+        """Of the last motion, and g's part of it [rad, m, rad]."""
         self.force = self.a.new_zeros(len(self.hand.pads)) if force is None else force
         self._begin(force)
         return self.observe()
@@ -110,10 +112,10 @@ class ModelHand:
             contacts = self.kinematic.touching(self.state)
             lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
             if not lin.forces.solved:
-                self.failure = str(lin.doubts[0])
+                self.failure = GraspEndsError(str(lin.doubts[0]))
             self._motion, self._linearization = ContactMotion(self.kinematic, lin), lin
         except GraspError as error:
-            self.failure = str(error)
+            self.failure = error
 
     def _move(self, w: Tensor, motion: ContactMotion) -> None:
         correction = None
@@ -125,9 +127,11 @@ class ModelHand:
             if correction is not None:
                 motion.shift(correction)
         except GraspError as error:
-            self.failure = str(error)
+            self.failure = error
             return
         self._motion, self._linearization, self._way = motion, None, w
+        self.increment = motion.state.minus(self.state)
+        self.correction = torch.zeros_like(self.increment) if correction is None else correction
         self.state, self.a = motion.state, self.a + w
         pads = [pad.name for pad in self.hand.pads]
         before, force = self.force, self.force.new_tensor([step.normal.get(pad, 0.0) for pad in pads])

@@ -39,10 +39,18 @@ class Situation:
     """Of the object [N]."""
     tighter: float = 0.0
     """Wanted on top of the grip that suits the object [N]."""
-    drift: Array | float = 0.0
-    """By which the normal forces change more than the model says, with each motion ``(n_c,)`` [N]."""
+    drift: Array | None = None
+    """By which the normal forces change more than the model says, with each motion ``(n_c,)`` [N]; None: 0."""
     grip: float | None = None
     """Wanted of the finger that opposes the others, see :class:`GripForceTask` [N]; None: nothing."""
+
+    def drift_of(self, contacts: list[int]) -> Array:
+        """:attr:`drift` of some of the contacts."""
+        return np.zeros(len(contacts)) if self.drift is None else self.drift[contacts]
+
+    def pads(self, kinematic: Linearization) -> list[int]:
+        """Which contacts are pads'; the others are links without one."""
+        return self.hand.pad_rows(kinematic.contacts.finger)[0]
 
     def normal_force(self, kinematic: Linearization) -> Array | None:
         """``f_n`` of each contact [N]: as its pad measures it, or else as the model estimates it.
@@ -52,7 +60,9 @@ class Situation:
         estimated = as_array(kinematic.forces.normal) if kinematic.forces.solved else None
         if self.fingertip_force is None:
             return estimated
-        measured = as_array(self.fingertip_force)[self.hand.pad_indices(kinematic.contacts.finger)]
+        rows, pads = self.hand.pad_rows(kinematic.contacts.finger)
+        measured = np.full(len(kinematic.contacts.finger), np.nan)  # of a link without a pad
+        measured[rows] = as_array(self.fingertip_force)[pads]
         return np.where(np.isnan(measured), 0.0 if estimated is None else estimated, measured)
 
 

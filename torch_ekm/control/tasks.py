@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..exceptions import ParameterError, ShapeError
-from .pace import contact_travel
+from .limiting import contact_travel
 from .qp import DEGREE, Equality, Squares, as_array
 from .situation import LinearizedModel, Situation, grip_shares
 
@@ -103,9 +103,10 @@ class GripForceTask:
         f_n = seen.normal_force(model.kinematic)
         if f_n is None:
             return None
-        wanted = grip_shares(f_n, self.wanted(model.kinematic, seen))
-        change = np.clip(wanted - f_n, -self.step, self.step) - seen.drift
-        return Squares(as_array(model.kinematic.normal_force_sensitivity), change, self.weight)
+        pads = seen.pads(model.kinematic)
+        wanted = grip_shares(f_n[pads], self.wanted(model.kinematic, seen))
+        change = np.clip(wanted - f_n[pads], -self.step, self.step) - seen.drift_of(pads)
+        return Squares(as_array(model.kinematic.normal_force_sensitivity)[pads], change, self.weight)
 
     def wanted(self, kinematic: Linearization, seen: Situation) -> float:
         """f, of the finger that opposes the others [N]."""

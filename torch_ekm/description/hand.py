@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -149,6 +149,12 @@ class HandDescription:
         """
         pads = [pad.name for pad in self.pads]
         return [pads.index(name) for name in names]
+
+    def pad_rows(self, names: Sequence[str]) -> tuple[list[int], list[int]]:
+        """Which of the names are pads' and not links', and their places among :attr:`pads`."""
+        pads = [pad.name for pad in self.pads]
+        rows = [i for i, name in enumerate(names) if name in pads]
+        return rows, [pads.index(names[i]) for i in rows]
 
     @property
     def actuator_names(self) -> tuple[str, ...]:

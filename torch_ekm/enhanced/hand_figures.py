@@ -83,6 +83,14 @@ class DescribedFigures(Recorded, nn.Module):
     def learn(self, lin: Linearization, moved: Tensor, increment: Tensor) -> None:
         """Does nothing."""
 
+    def learn_path(
+        self, path: Sequence[tuple[Linearization, Tensor]], moved: Tensor, off: Tensor, nominal: Tensor
+    ) -> None:
+        """Does nothing."""
+
+    def twist_slopes(self, lin: Linearization, pull: Tensor) -> None:
+        """Nothing is unsure."""
+
     def begin(self, a: Tensor) -> None:
         """There is no play."""
 
@@ -270,47 +278,81 @@ class HandFigures(ParameterFilter):
     def learn(
         self, lin: Linearization, moved: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
     ) -> FilterReport | None:
-        """Learn from one motion.
+        """Learn from one motion: :meth:`learn_path` of a single piece.
 
         Args:
             lin: of the state before it.
             moved: w, what the encoders did [rad]; before :meth:`commit`.
             increment: ds, as measured.
+        """
+        check_kind("lin", lin, Linearization, "a Linearization, e.g. model.linearize(state)")
+        check_shape("moved", moved, lin.manipulation_jacobian[0].shape, "of the motors")
+        check_finite("moved", moved)
+        check_shape("increment", increment, lin.manipulation_jacobian[:, 0].shape)
+        motion = None if lin.equations is None else self.solve(lin.equations)
+        if motion is None:
+            return None
+        pull = self._pull(moved.to(self.mean))[0].to(motion.jacobian)
+        nominal = motion.jacobian @ pull
+        return self.learn_path([(lin, pull)], moved, increment - nominal, nominal)
+
+    @torch.no_grad()
+    def learn_path(
+        self,
+        path: Sequence[tuple[Linearization, Float[Tensor, " n_a"]]],
+        moved: Float[Tensor, " n_a"],
+        off: Float[Tensor, " n_s"],
+        nominal: Float[Tensor, " n_s"],
+    ) -> FilterReport | None:
+        """Learn from one movement.
+
+        Args:
+            path: linearizations along it, and what the tendons did from each to the next [rad].
+            moved: what the encoders did from the first to the end [rad]; before :meth:`commit`.
+            off: ds as measured, less what f predicts.
+            nominal: what f predicts.
 
         Returns:
-            None: the motion cannot be modelled, went against its prediction, or nothing moved.
+            None: the movement cannot be modelled, went against its prediction, or nothing moved.
 
         Raises:
             ShapeError, NonFiniteError: nothing is changed.
         """
-        check_kind("lin", lin, Linearization, "a Linearization, e.g. model.linearize(state)")
-        for name, value, like in (("moved", moved, lin.manipulation_jacobian[0]),
-                                  ("increment", increment, lin.manipulation_jacobian[:, 0])):  # fmt: skip
+        first = path[0][0]
+        for name, value, like in (("moved", moved, first.manipulation_jacobian[0]),
+                                  ("off", off, first.manipulation_jacobian[:, 0])):  # fmt: skip
             check_shape(name, value, like.shape, "of the motors" if name == "moved" else "")
             check_finite(name, value)
-        if lin.equations is None or not bool(moved.any()):
+        if first.equations is None or not bool(moved.any()):
             return None
-        motion = self.solve(lin.equations)
+        joints = first.equations.moving.nonzero()[:, 0].tolist()
+        rows = [*joints, *range(first.n_q, first.n_q + 6)]
+        by_width, slope = self._pull(moved.to(self.mean))[1] / len(path), 0.0
+        for lin, pull in path:
+            slopes = self._slopes(lin, pull, rows, by_width)
+            if slopes is None:
+                return None
+            slope = slope + slopes
+        wrong, predicted = off.double().numpy()[rows], nominal.double().numpy()[rows]
+        noise = _noise(predicted, len(joints), float(first.lever))
+        if ((predicted + wrong) * predicted / noise).sum() < -0.5 * (predicted**2 / noise).sum():
+            return None  # figures do not turn a motion round: a sign is wrong, or a contact slid
+        return self.update(*map(torch.from_numpy, (wrong, slope, noise)))
+
+    def twist_slopes(self, lin: Linearization, pull: Float[Tensor, " n_a"]) -> Array | None:
+        """``d(J_m w)/d theta`` of the object's rows ``(6, n)``; None: the model has no motion there."""
+        return self._slopes(lin, pull, list(range(lin.n_q, lin.n_q + 6)), 0.0)
+
+    def _slopes(self, lin: Linearization, pull: Tensor, rows: list[int], by_width: Array | float) -> Array | None:
+        motion = None if lin.equations is None else self.solve(lin.equations)
         if motion is None:
             return None
-        n_q = lin.n_q
-        pull, by_width, _ = self._pull(moved.to(self.mean))
-        pull = pull.to(motion.jacobian)
-        joints = lin.equations.moving.nonzero()[:, 0].tolist()
-        rows = [*joints, *range(n_q, n_q + 6)]
-        derivatives = (*motion.derivative(pull, rows), motion.jacobian[rows])
-        J, w, ds, *derivatives = (
-            x.double().numpy() for x in (motion.jacobian, pull, increment, *derivatives)
-        )
-        predicted, came = J[rows] @ w, ds[rows]
-        noise = _noise(predicted, len(joints), float(lin.lever))
-        if (came * predicted / noise).sum() < -0.5 * (predicted**2 / noise).sum():
-            return None  # figures do not turn a motion round: a sign is wrong, or a contact slid
-        parts = zip(derivatives, self._at, strict=True)
+        derivatives = (*motion.derivative(pull.to(motion.jacobian), rows), motion.jacobian[rows])
+        parts = zip((x.double().numpy() for x in derivatives), self._at, strict=True)
         phi = np.concatenate([part[:, *at] for part, at in parts if len(at)], axis=-1)
         phi[:, self._is_play] *= by_width
-        slope = self._prior_std * np.where(self._is_play, 1.0, self._described * self._factors)
-        return self.update(*map(torch.from_numpy, (came - predicted, phi * slope, noise)))
+        slopes: Array = phi * self._prior_std * np.where(self._is_play, 1.0, self._described * self._factors)
+        return slopes
 
     @property
     def figures(self) -> tuple[Figure, ...]:

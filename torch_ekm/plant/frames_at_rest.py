@@ -50,27 +50,32 @@ class FramesAtRest(PlantWrapper):
             readings.append(self.plant.observe())
         if self.frames == 1 or readings[-1].status is PlantStatus.LOST:
             return readings[-1]
-        shown = [o for o in readings if o.status is PlantStatus.HELD]
-        last = readings[-1]
-        position, rotation, status, stamps = last.position, last.rotation, PlantStatus.NOT_SEEN, last.stamps
-        covariance = last.q.new_full((6, 6), torch.nan)
-        if shown:
-            status = PlantStatus.HELD
-            position, rotation, covariance = _mean_pose(shown)
-            stamps = last.taken._replace(pose=min(o.taken.pose for o in shown))  # no newer than any of them
-        forces = [o.fingertip_force for o in readings if o.fingertip_force is not None]
-        info = {**last.info, **{name: seen.info[name] for name in ("events",) if name in seen.info}}
-        info["estimate"] = {**info.get("estimate", {}), "pose_covariance": covariance}
-        return dataclasses.replace(
-            last,
-            q=torch.stack([o.q for o in readings]).mean(0),
-            position=position,
-            rotation=rotation,
-            fingertip_force=torch.stack(forces).mean(0) if forces else None,
-            status=status,
-            info=info,
-            stamps=stamps if last.dated else None,
-        )
+        return mean_reading(readings)
+
+
+def mean_reading(readings: Sequence[Observation]) -> Observation:
+    """What several readings of a hand at rest say together, see :class:`FramesAtRest`."""
+    shown = [o for o in readings if o.status is PlantStatus.HELD]
+    last = readings[-1]
+    position, rotation, status, stamps = last.position, last.rotation, PlantStatus.NOT_SEEN, last.stamps
+    covariance = last.q.new_full((6, 6), torch.nan)
+    if shown:
+        status = PlantStatus.HELD
+        position, rotation, covariance = _mean_pose(shown)
+        stamps = last.taken._replace(pose=min(o.taken.pose for o in shown))  # no newer than any of them
+    forces = [o.fingertip_force for o in readings if o.fingertip_force is not None]
+    info = {**last.info, **{name: readings[0].info[name] for name in ("events",) if name in readings[0].info}}
+    info["estimate"] = {**info.get("estimate", {}), "pose_covariance": covariance}
+    return dataclasses.replace(
+        last,
+        q=torch.stack([o.q for o in readings]).mean(0),
+        position=position,
+        rotation=rotation,
+        fingertip_force=torch.stack(forces).mean(0) if forces else None,
+        status=status,
+        info=info,
+        stamps=stamps if last.dated else None,
+    )
 
 
 def _mean_pose(

@@ -20,7 +20,7 @@ from .readings import ReadingTests, deg
 from .safety import Objection
 
 if TYPE_CHECKING:
-    from ...model import KinematicModel, Linearization
+    from ...model import KinematicModel
 
 _DEG = math.pi / 180
 _NOWHERE = 0.5 * _DEG  # an encoder moves less in a motion in which its motor is sent nowhere
@@ -79,11 +79,10 @@ class Consistency:
         sent: Tensor,
         seen: Observation,
         expected: Expectation | None,
-        lin: Linearization | None,
     ) -> tuple[Row | None, Objection | None]:
         """The row that objects to a motion, if any; and why the manipulation ends by it, if it does."""
         found, halt = None, None
-        for name, test in self._tests(before, sent, seen, expected, lin).items():
+        for name, test in self._tests(before, sent, seen, expected).items():
             self._running[name] = self._running[name] + 1 if test.figure > test.limit else 0
             if self._running[name]:
                 found = test
@@ -97,7 +96,6 @@ class Consistency:
         sent: Tensor,
         seen: Observation,
         expected: Expectation | None,
-        lin: Linearization | None,
     ) -> dict[str, Row]:
         moved = (seen.a - before.a).where(sent == 0, 0.0)
         i = int(moved.abs().argmax())
@@ -109,8 +107,7 @@ class Consistency:
                 True,
             )
         }  # fmt: skip
-        if expected is not None and lin is not None:
-            described = lin.described_jacobian @ expected.moved
+        if expected is not None:
             share, sharp = self.readings.share(before, seen, expected.nominal)
             tests["sign"] = Row(
                 -share * (sharp >= _SHARP), -_AGAINST, 2, StopReason.WRONG_WAY,
@@ -119,7 +116,7 @@ class Consistency:
                 "'torch-ekm check --plant'",
                 False,
             )  # fmt: skip
-            rate, sure = self._drift(before, seen, expected.moved, described)
+            rate, sure = self._drift(before, seen, expected.moved, expected.described)
             i = int(abs(sure).argmax())
             tests["driven"] = Row(
                 float(abs(sure[i]) * (abs(rate[i]) > _DRIFTS)), _SURE, 1, StopReason.ENCODER_DRIFT,

@@ -60,7 +60,7 @@ class FingertipWatch:
     def before(self, decision: Decision, seen: Observation) -> Objection | None:
         """Pads that do not measure press too hard, by the model's estimate."""
         lin = decision.linearization
-        if lin is None or not lin.forces.solved or decision.share == 0.0:  # the way back is no new motion
+        if lin is None or not lin.forces.solved:
             return None
         estimate = lin.forces.normal
         if seen.fingertip_force is not None:

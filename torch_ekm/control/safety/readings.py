@@ -16,6 +16,7 @@ from .safety import Guards, Objection
 
 if TYPE_CHECKING:
     from ...description import HandDescription
+    from ..focus import FocusedPose
 
 _DEG = math.pi / 180
 _NAMES = ("the encoders' reading", "the joints' reading", "the object's pose")
@@ -245,6 +246,15 @@ class ReadingTests:
         weighted = wanted / self._noise(before, seen)
         size = float(wanted @ weighted)
         return float(ds @ weighted) / max(size, 1e-12), math.sqrt(size)
+
+    def pose_noise(self, seen: Observation, focus: FocusedPose) -> float:
+        """Standard deviation of a pose in the focus, as a turn [rad]: as stated, or the guards'."""
+        unit = torch.tensor([self.guards.translation_noise] * 3 + [self.guards.rotation_noise] * 3).double()
+        cov = seen.info.get("estimate", {}).get("pose_covariance")
+        if cov is None or not bool(torch.isfinite(cov).all()):
+            cov = torch.diag(unit.square())
+        M = focus.matrix
+        return float((focus.tolerance_scale * (M @ cov @ M.mT).diagonal().clamp(min=0.0).sqrt()).max())
 
     def _stated(self, reading: Observation) -> Array:
         """Variances of a pose ``(6,)``: as stated, and no less than what the guards allow."""

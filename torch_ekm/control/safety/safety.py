@@ -1,4 +1,4 @@
-"""Why a closed loop looks again, goes back, stops or gives up: the reasons, and the figures behind them."""
+"""Why a closed loop looks again and stops: the reasons, and the figures behind them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from ...plant import Stamps
 from ..decision import StopReason
 
 _DEG = math.pi / 180
-OFF_BY_SHIFTS = 1.5  # times off_rotation: a shift of 3 mm alone turns the object by 8 to 10 deg
 _MAX_AGE = Stamps(encoders=0.2, joints=0.2, pose=0.4, fingertips=0.4)
 
 
@@ -31,7 +30,8 @@ class Objection(NamedTuple):
 class StoppingRule:
     """Explicit parameters of the stopping rule; the same for every controller that is compared.
 
-    * reached: ``|e| <= tolerance`` in ``settle_steps`` observations in a row;
+    * reached: ``|e| <= tolerance``, e by the mean of ``looks`` to ``most_looks`` readings at rest: further
+      ones are taken while the mean is nearer to the tolerance than it is sure;
     * stalled: within the last ``stall_window`` steps the smallest ``|e|`` fell by less than
       ``stall_progress``;
     * actuator limits: as stalled, while some actuator that matters stood at its limit;
@@ -42,7 +42,8 @@ class StoppingRule:
 
     tolerance: float = 0.25 * _DEG
     """[rad], see :class:`~torch_ekm.control.FocusedPose`; at 0.25 deg each direction has its own."""
-    settle_steps: int = 2
+    looks: int = 2
+    most_looks: int = 4
     stall_window: int = 12
     stall_progress: float = 0.1 * _DEG
     """[rad], likewise"""
@@ -50,7 +51,7 @@ class StoppingRule:
     off_limit: float = 30 * _DEG
 
     def __post_init__(self) -> None:
-        for name in ("tolerance", "settle_steps", "stall_window", "max_steps", "off_limit"):
+        for name in ("tolerance", "looks", "most_looks", "stall_window", "max_steps", "off_limit"):
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
 
@@ -60,9 +61,6 @@ class StoppingRule:
         Args:
             limited: the last step was cut short by an actuator's limit.
         """
-        recent = errors[-self.settle_steps :]
-        if len(recent) == self.settle_steps and max(recent) <= self.tolerance:
-            return StopReason.REACHED
         if len(errors) > self.stall_window:
             before, after = min(errors[: -self.stall_window]), min(errors[-self.stall_window :])
             if before - after < self.stall_progress:
@@ -70,42 +68,6 @@ class StoppingRule:
         if len(errors) > self.max_steps:
             return StopReason.STEP_LIMIT
         return StopReason.RUNNING
-
-
-@dataclass(frozen=True)
-class Caution:
-    """What announces a loss before it comes, and what is done then; the same for every controller.
-
-    Signs: the model refuses the state; the object has turned off the focus by ``off_rotation``; a link
-    without a pad comes to bear on the object; a finger loses its force against the prediction in three
-    motions running. One that ``looks`` further readings show as well is heeded:
-    the hand goes back along the way that was come, motion by motion, until the signs are gone, for these
-    states are known to hold. It grips by ``tighten`` more and tries again at a smaller pace, ``retreats``
-    times; at the next sign it goes back once more and gives up. Where going back does not help, it gives up
-    at once: an object that has slid off the focus does not come back, and turned on it slips out.
-    """
-
-    looks: int = 2
-    """Further readings before a sign is believed."""
-    off_rotation: float = 8 * _DEG
-    """[rad]; ``OFF_BY_SHIFTS`` times as much where the focus holds no turn, a rehearsal apart"""
-    link_gap: float = 0.2e-3
-    """A link without a pad as near to the object as this counts, unless it was so near at the start [m]."""
-    retreats: int = 1
-    way_back: int = 4
-    """Motions of one retreat at most."""
-    tighten: float = 1.0
-    """[N]"""
-    slip: float = 0.5
-    """Where an object moves otherwise than an E-KM predicts, the grip is tightened by so much [N]."""
-    grips: int = 5
-    """Motions at most that only grip, where a finger bears less than the object needs before the first turn;
-    a grasp that stays weak is declined."""
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name != "link_gap" and not value >= 0:  # a link may overlap by so much
-                raise ParameterError(name, value, "0 or more")
 
 
 @dataclass(frozen=True)
@@ -185,13 +147,10 @@ class Guards:
 
 @dataclass(frozen=True)
 class Safety:
-    """Which readings count, when the hand looks again, goes back, stops and gives up; the same for every
-    controller that is compared. A grasp that is unstable has no figure: the model has no step.
+    """Which readings count, and when the hand stops; the same for every controller that is compared.
     """
 
     rule: StoppingRule = StoppingRule()
     """Reached, stalled, step limit, actuator limits, object lost."""
-    caution: Caution = Caution()
-    """Given up."""
     guards: Guards = Guards()
     """Stale sensor, and all reasons that follow it in :class:`StopReason`."""

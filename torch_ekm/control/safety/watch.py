@@ -14,14 +14,14 @@ from ...kinematics.servo_model import IdealServos
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
+from ..lessons import felt
 from .consistency import Consistency
 from .fingertips import Fingertips, FingertipWatch
-from .grip import GripWatch
 from .readings import ReadingTests, agree, deg
 from .safety import Guards, Objection
 
 if TYPE_CHECKING:
-    from ...model import KinematicModel, Linearization
+    from ...model import KinematicModel
 
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
@@ -52,7 +52,6 @@ class Watch:
     Args:
         guards: limits.
         model: f, with the hand.
-        expect: f + g of what the encoders did, from where the model was linearized.
         tolerance: of the target [rad]; errors that grow by more are no noise.
         servo: what is known of the servos; None: they are ideal.
     """
@@ -61,11 +60,10 @@ class Watch:
         self,
         guards: Guards,
         model: KinematicModel,
-        expect: Callable[[Linearization, Tensor], Expectation],
         tolerance: float = math.inf,
         servo: ServoModel | IdealServos | None = None,
     ) -> None:
-        self.guards, self.hand, self._expect = guards, model.hand, expect
+        self.guards, self.hand, self._least = guards, model.hand, model.options.forces.normal_std
         self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
         servo = IdealServos(model.hand.actuator_names) if servo is None else servo
         self.consistency = Consistency(self.readings, model, servo)
@@ -73,7 +71,6 @@ class Watch:
         """Motions in succession without a pose."""
         self.gated = 0
         """Motions in succession that nothing but the gate objects to."""
-        self.grip = GripWatch(model)
         self.slid = ""
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
         self.lie = ""
@@ -107,17 +104,22 @@ class Watch:
         decision: Decision,
         sent: Tensor,
         after: Observation,
+        expect: Callable[[Tensor], Expectation],
         look: Callable[[], Observation],
     ) -> Verdict:
-        """Judge a motion of the motors by ``sent`` [rad]; where its reading is in doubt, ``look`` gives
-        another."""
+        """Judge a movement of the motors by ``sent`` [rad].
+
+        Args:
+            expect: f + g of what the encoders did.
+            look: gives another reading where the first is in doubt.
+        """
         self.slid = ""
-        seen, last, doubt, expected = self._look(before, decision, sent, after, look)
+        seen, last, doubt, expected = self._look(before, decision, sent, after, expect, look)
         if seen.status is PlantStatus.LOST:
             return Verdict(seen, False)
         if doubt is not None and not (doubt.blind or doubt.gated):
             if doubt.reason is StopReason.POSE_JUMP:
-                self.slid = self._slid(decision, before, expected, last, seen)
+                self.slid = self._slid(before, expected, last, seen)
             if not self.slid:  # empty but for a pose that jumps
                 return Verdict(seen, False, doubt, "", expected)
             doubt = doubt._replace(gated=True, message=self.slid)
@@ -130,7 +132,7 @@ class Watch:
         verdict = self._verdict(before, seen, doubt, expected, tips)
         if (doubt is not None and doubt.blind) or self.slid:
             return verdict
-        odd, halt = self.consistency.motion(before, sent, seen, expected, decision.linearization)
+        odd, halt = self.consistency.motion(before, sent, seen, expected)
         if odd is None:
             self.lie = self.lie or ("" if tips.true else tips.note)
             return verdict if tips.true else verdict._replace(teaches=False)
@@ -146,6 +148,7 @@ class Watch:
         decision: Decision,
         sent: Tensor,
         seen: Observation,
+        expect: Callable[[Tensor], Expectation],
         look: Callable[[], Observation],
     ) -> tuple[Observation, Observation | None, Objection | None, Expectation | None]:
         """The reading to be judged, the look before it, what speaks against it, and what was expected."""
@@ -153,8 +156,8 @@ class Watch:
         for left in range(self.guards.looks, -1, -1):
             if seen.status is PlantStatus.LOST:
                 break
-            if decision.linearization is not None and (last is None or not torch.equal(seen.a, last.a)):
-                expected = self._expect(decision.linearization, seen.a - before.a)
+            if decision.pieces and (last is None or not torch.equal(seen.a, last.a)):
+                expected = expect(seen.a - before.a)
             doubt = self.readings.after_motion(before, sent, seen, expected, self.blind)
             if left == 0 or (doubt is None and not self.fingertips.high(seen)):
                 return seen, last, doubt, expected
@@ -189,18 +192,16 @@ class Watch:
 
     def _slid(
         self,
-        decision: Decision,
         before: Observation,
         expected: Expectation | None,
         last: Observation | None,
         seen: Observation,
     ) -> str:
         """A pose that jumps is the object's where two looks agree and the grip has changed, too."""
-        lin = decision.linearization
-        if lin is None or expected is None or last is None or not agree(last, seen, self.guards):
+        if expected is None or last is None or not agree(last, seen, self.guards):
             return ""
-        felt = self.grip.surprise(lin, before, expected.moved, seen)
-        if felt is None or not felt.wrong:
+        surprise = felt(self.hand, self._least, expected, before, seen)
+        if surprise is None or not surprise.wrong(before):
             return ""
         ds = (seen.state.minus(before.state) - expected.increment)[-6:]
         way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
@@ -210,7 +211,7 @@ class Watch:
         """The object goes away from its target, again and again, while the motors obey. Where it has come
         half the way, no sign is wrong: the grasp turns no further, and the stopping rule says so."""
         da = decision.delta_a
-        if decision.share == 0.0 or min(errors) < 0.5 * errors[0]:  # the way back, or a way that led there
+        if min(errors) < 0.5 * errors[0]:  # a way that led there
             return None
         away = errors[-1] - errors[-2] > self._tolerance and float(moved @ da) > 0.5 * float(da @ da)
         self._away = self._away + 1 if away else 0
@@ -227,10 +228,18 @@ class Watch:
         """Which sensors contradict each other where the model refuses a state."""
         return self.consistency.suspects(seen)
 
-    def forget(self) -> None:
-        """Signs of a loss are heeded: the hand goes back."""
-        self.slid = ""
-        self.grip.forget()
+    def weak(self, decision: Decision, seen: Observation) -> str:
+        """Fingers that bear less than the object needs, as measured; empty: none."""
+        grip, lin = decision.grip, decision.linearization
+        if grip is None or lin is None or seen.fingertip_force is None:  # an estimate is no reason
+            return ""
+        rows, _ = self.hand.pad_rows(lin.contacts.finger)
+        bears = zip(rows, grip.force.tolist(), grip.least.tolist(), strict=True)
+        return ", ".join(
+            f"finger '{lin.contacts.finger[i]}' bears {force:.1f} N of {least:.1f} N"
+            for i, force, least in bears
+            if force < least
+        )
 
     def rest(self, before: Observation, seen: Observation) -> Observation:
         """A further reading of a hand at rest, or ``before`` where it cannot be one."""

@@ -1,0 +1,110 @@
+"""How sure a model is of where a movement leads."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ..kinematics import GraspState
+from ..typing import Float, Tensor
+from .model_error import NOISE
+
+if TYPE_CHECKING:
+    from ..plant import Observation
+    from .controller import LookAndMoveController
+    from .decision import Piece
+    from .focus import PoseTarget
+    from .knowledge import HandKnowledge
+
+_DEG = math.pi / 180
+_LEVER = 0.03  # [m]: a share of a rotation counts as much as that share of this translation
+_SHARE = 0.15  # of the way that a normal force has come: what the model does not know of it
+
+
+@dataclass(frozen=True)
+class Band:
+    """Predictions at a waypoint with their standard deviations."""
+
+    off: float
+    """Rotation off the focus [rad]."""
+    off_std: float
+    twist_std: Float[Tensor, " 6"]
+    """Of the object's motion until then [m, rad], hand axes."""
+    force: Float[Tensor, " n_pads"] | None
+    """Normal forces of the pads that touched at the start [N], NaN of the others; None: not measured."""
+    force_std: Float[Tensor, " n_pads"] | None
+
+    def __str__(self) -> str:
+        text = f"{self.off / _DEG:.1f} +- {self.off_std / _DEG:.1f} deg off the axis"
+        if self.force is None or self.force_std is None:
+            return text
+        pairs = zip(self.force.tolist(), self.force_std.tolist(), strict=True)
+        return f"{text}, {', '.join(f'{f:.1f} +- {s:.1f} N' for f, s in pairs if not math.isnan(f))}"
+
+
+class Bands:
+    """Standard deviations along a path, from its beginning::
+
+        Sigma = G P G' + (sum sd_g)^2 + (s way)^2 + n^2,   G = sum d(J_m w)/d figures
+        sd_f^2 = s_f^2 + u' P_f u + (0.15 sum |df_n|)^2
+
+    of the object's motion: covariance P of the hand's figures, deviation sd_g of g, share s of
+    :class:`ModelError` and noise n of a motion; of the normal forces: noise and covariance of
+    :class:`ForceSensitivity`. All of it errs alike along a path, so deviations add up, not variances.
+    """
+
+    def __init__(
+        self,
+        controller: LookAndMoveController,
+        knowledge: HandKnowledge,
+        seen: Observation,
+        target: PoseTarget,
+    ) -> None:
+        self._controller, self._knowledge, self._target = controller, knowledge, target
+        self._start, n_pads = seen.state, len(controller.kinematic.hand.pads)
+        self._force = seen.fingertip_force
+        self._figures = np.zeros((6, 0))
+        self._g, self._way = np.zeros(6), 0.0
+        self._pull = torch.zeros_like(seen.a)
+        self._said = torch.zeros(n_pads, dtype=torch.float64)  # S w
+        self._swing = torch.zeros(n_pads, dtype=torch.float64)  # sum |df|
+        self._pads: list[int] | None = None
+
+    def add(self, piece: Piece, state: GraspState) -> Band:
+        """One more piece, which leads to a state."""
+        controller, hand = self._controller, self._controller.kinematic.hand
+        twist, lin = piece.increment[-6:].numpy(), piece.linearization
+        self._way += math.sqrt(twist[3:] @ twist[3:] + twist[:3] @ twist[:3] / _LEVER**2 * 0)
+        self._pull = self._pull + piece.action
+        if controller.enhanced is not None:
+            _, variance = controller.enhanced.correction(piece.state, piece.action, state.n_s)
+            self._g += variance[-6:].sqrt().numpy()
+        cov = np.diag(self._g**2)
+        slopes = self._knowledge.figures.twist_slopes(lin, piece.action) if controller.enhanced else None
+        if slopes is not None:
+            self._figures = self._figures + slopes if self._figures.size else slopes
+            cov += self._figures @ self._knowledge.figures.covariance.numpy() @ self._figures.T
+        unit = np.array([_LEVER] * 3 + [1.0] * 3)
+        cov += np.diag((unit * self._knowledge.error.share * self._way) ** 2 + (unit * NOISE) ** 2)
+        focus = controller.focus
+        rows = focus.off_matrix[~focus.off_translation].numpy()
+        off_std = math.sqrt(max(float(np.linalg.eigvalsh(rows @ cov @ rows.T)[-1]), 0.0)) if len(rows) else 0.0
+        off = focus.off_rotation(self._target.error(state))
+        force = force_std = None
+        if self._force is not None and piece.force is not None:
+            rows_, pads = hand.pad_rows(lin.contacts.finger)
+            if self._pads is None:
+                self._pads, self._last = pads, self._force
+            self._said[pads] += (lin.described_normal_sensitivity @ piece.action)[rows_]
+            self._swing += (piece.force - self._last).abs().nan_to_num()
+            self._last = piece.force
+            known = torch.zeros(len(self._said), dtype=torch.bool)
+            known[self._pads] = True
+            force = piece.force.nan_to_num().where(known, torch.nan)
+            spread = self._knowledge.forces.spread(self._pull, self._said)
+            force_std = (spread.square() + (_SHARE * self._swing).square()).sqrt()
+        return Band(off, off_std, torch.from_numpy(np.sqrt(cov.diagonal())), force, force_std)

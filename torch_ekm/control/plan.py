@@ -1,0 +1,227 @@
+"""A turn as one movement: its path, how sure the model is of it, and how far it is safe to go."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+
+from ..kinematics import GraspState
+from ..plant import Observation
+from ..typing import Tensor
+from .bands import Band, Bands
+from .decision import Decision, Piece, StopReason
+from .focus import FocusedPose, PoseTarget
+from .rehearsal import LONGEST, End, PathEnd, Rehearsal
+
+if TYPE_CHECKING:
+    from .controller import LookAndMoveController
+    from .knowledge import HandKnowledge
+
+_DEG = math.pi / 180
+_AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
+_CLOSE = 0.3 * _DEG  # [rad] from which one is enough
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """A piece of the path, where it leads, and how sure the model is of that."""
+
+    piece: Piece
+    state: GraspState
+    band: Band
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The path of a movement, by f + g, with contacts that stick, slide, open and close."""
+
+    target: PoseTarget
+    focus: FocusedPose
+    start: GraspState
+    decision: Decision
+    """The movement to make: to the last safe waypoint, or why there is none."""
+    waypoints: tuple[Waypoint, ...] = ()
+    safe: int = 0
+    """How many of the waypoints may be passed."""
+    end: End = field(default_factory=End)
+    """What ends the path."""
+    against: str = ""
+    """What is not safe beyond ``safe``; empty: nothing."""
+
+    @property
+    def states(self) -> tuple[GraspState, ...]:
+        """At the start and at each waypoint."""
+        return (self.start, *(one.state for one in self.waypoints))
+
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """Focused error there, as a turn [rad]."""
+        return tuple(self.focus.error(self.target, state) for state in self.states)
+
+    def __str__(self) -> str:
+        errors = [error / _DEG for error in self.errors]
+        first = f"{errors[0]:.1f} deg to go; {self.safe} of {len(self.waypoints)} waypoints are safe"
+        first += f", then {self.against}" if self.against else ""
+        if self.end.kind is not PathEnd.NOTHING:
+            first += f"; the path ends {errors[-1]:.1f} deg before the target ({self.end})"
+        points = zip(errors[1:], self.waypoints, strict=True)
+        return "\n".join([first, *(f"  {left:5.2f} deg to go, {one.band}" for left, one in points)])
+
+
+class Planner(Protocol):
+    """What decides how a loop moves. One of your own needs no more than this method."""
+
+    def plan(
+        self,
+        controller: LookAndMoveController,
+        seen: Observation,
+        target: PoseTarget,
+        knowledge: HandKnowledge,
+        firm: float,
+    ) -> Plan:
+        """The next movement.
+
+        Args:
+            seen: where it begins, as measured.
+            firm: share of the wanted grip with which is turned; with less it is gripped first. 0: it is
+                turned.
+        """
+        ...
+
+
+class OneStep:
+    """The loop of the E-KM paper: one step of the controller after the other."""
+
+    def plan(
+        self,
+        controller: LookAndMoveController,
+        seen: Observation,
+        target: PoseTarget,
+        knowledge: HandKnowledge,
+        firm: float,
+    ) -> Plan:
+        """See :class:`Planner`."""
+        if firm:
+            here = PoseTarget(seen.position, seen.rotation)
+            grips = controller.decide(seen.state, seen.a, here, seen.fingertip_force)
+            if grips.grip is not None and grips.grip.weak:
+                return Plan(target, controller.focus, seen.state, _gripping(grips))
+        decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
+        return Plan(target, controller.focus, seen.state, decision)
+
+
+@dataclass(frozen=True)
+class WholeTurn:
+    """Rehearse the turn on a :class:`ModelHand`, and go as far along its path as is safe.
+
+    A waypoint is safe where at two standard deviations (:class:`~torch_ekm.control.Bands`) the object stays
+    near the axis and each finger keeps a force. The bands of a hand of which nothing is known are wide, and
+    its movements small. The error that is left is no reason to stop short: the next look corrects it.
+
+    Sources: chance constraints by propagated covariances, Hewing, Kabzan and Zeilinger, IEEE TCST 28 (2020).
+    """
+
+    piece: float = 2.5 * _DEG
+    """Largest step of the rehearsal [rad]."""
+    deviations: float = 2.0
+    off_rotation: float = 8 * _DEG
+    """Off the focus [rad]."""
+    force: float = 0.6
+    """Of a finger that touches [N]."""
+    margin: float = 2 * _DEG
+    """What a first piece alone may go beyond ``off_rotation``; forces do not hold it [rad]."""
+
+    def plan(
+        self,
+        controller: LookAndMoveController,
+        seen: Observation,
+        target: PoseTarget,
+        knowledge: HandKnowledge,
+        firm: float,
+        whole: bool = False,
+        longest: float = LONGEST,
+    ) -> Plan:
+        """See :class:`Planner`.
+
+        Args:
+            whole: the path goes on where it is not safe.
+            longest: way of an actuator in the whole movement [rad].
+        """
+        focus = controller.focus
+        if firm:
+            decision = self._grip(controller, seen, firm)
+            if decision is not None:
+                return Plan(target, focus, seen.state, decision)
+        rehearsal = Rehearsal(controller, seen, target, self.piece, longest)
+        bands = Bands(controller, knowledge, seen, target)
+        waypoints: list[Waypoint] = []
+        safe, against, nearest = 0, "", (focus.error(target, seen.state), 0)
+        for piece, state in rehearsal.pieces():
+            waypoints.append(Waypoint(piece, state, bands.add(piece, state)))
+            against = against or self._against(waypoints[-1].band, first=len(waypoints) == 1)
+            safe += not against
+            nearest = min(nearest, (focus.error(target, state), len(waypoints)))
+            since = len(waypoints) - nearest[1]
+            if (against and not whole) or since >= _AHEAD or (since and nearest[0] < _CLOSE):
+                break
+        end = rehearsal.end
+        del waypoints[nearest[1] :]
+        safe = min(safe, len(waypoints))
+        if not waypoints:  # the model does not go anywhere from here: one step to first order
+            decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
+            return Plan(target, focus, seen.state, decision, end=end)
+        decision = self._decision(controller, rehearsal, seen, waypoints[:safe], against)
+        return Plan(target, focus, seen.state, decision, tuple(waypoints), safe, end, against)
+
+    def _against(self, band: Band, first: bool) -> str:
+        """Why a waypoint is not safe; empty: it is."""
+        k = self.deviations
+        most = self.off_rotation + (self.margin if first else 0.0)
+        if band.off + k * band.off_std > most:
+            return f"the object may turn {(band.off + k * band.off_std) / _DEG:.1f} deg off the axis"
+        if first or band.force is None or band.force_std is None:
+            return ""
+        low = (band.force - k * band.force_std).nan_to_num(nan=math.inf)
+        return f"a finger may keep only {float(low.min()):.1f} N" if bool((low < self.force).any()) else ""
+
+    def _grip(self, controller: LookAndMoveController, seen: Observation, firm: float) -> Decision | None:
+        """The movement that grips as the object needs it; None: it is gripped so, or grips no better."""
+        rehearsal = Rehearsal(controller, seen, None, self.piece)
+        pieces = list(rehearsal.pieces())
+        first = rehearsal.first
+        if not pieces or first is None or first.grip is None:
+            return None
+        if float(first.grip.force.max()) >= firm * first.grip.wanted and not first.grip.weak:
+            return None
+        return _gripping(_joined(controller, seen, pieces, first))
+
+    def _decision(self, controller, rehearsal, seen, waypoints, against) -> Decision:
+        first = rehearsal.first
+        assert first is not None
+        if not waypoints:
+            return controller.none(StopReason.GIVEN_UP, against, first.desired)
+        return _joined(controller, seen, [(one.piece, one.state) for one in waypoints], first)
+
+
+def _joined(controller, seen, pieces, first) -> Decision:
+    """One movement of the pieces."""
+    predicted = pieces[-1][1].minus(seen.state)
+    nominal = torch.stack([one.linearization.described_jacobian @ one.action for one, _ in pieces]).sum(0)
+    return Decision(
+        torch.stack([one.action for one, _ in pieces]).sum(0),
+        StopReason.RUNNING,
+        controller.focus.matrix @ predicted[-6:],
+        predicted,
+        nominal,
+        tuple(one for one, _ in pieces),
+        grip=first.grip,
+    )
+
+
+def _gripping(decision: Decision) -> Decision:
+    import dataclasses
+
+    return dataclasses.replace(decision, turns=False)
