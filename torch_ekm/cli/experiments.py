@@ -78,15 +78,16 @@ def reproduce(
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """
-    from ..control import LimitingFunction, PaceOptions
+    from ..control import LimitingFunction
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
 
     if step is not None and not 0 < step <= 45:
         raise ParameterError("step", step, "more than 0 and at most 45 deg")
     limiting = LimitingFunction() if step is None else LimitingFunction(step=math.radians(step))
-    pace = PaceOptions(limiting=limiting)
-    setting = Setting(hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing, pace=pace)
+    setting = Setting(
+        hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing, limiting=limiting
+    )
     turns = parse_angles(angles) if angles else None
     chosen, things = parse_seeds(seeds), objects or None
     planned = plan(experiment, chosen, setting=setting, objects=things, angles_deg=turns, quick=quick)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
+from .bands import Band, Bands
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
-from .bands import Band, Bands
 from .decision import Decision, Piece, StopReason
 from .focus import Direction, FocusedPose, PoseTarget
 from .force_sensitivity import ForceSensitivity
@@ -15,8 +15,8 @@ from .limiting import LimitingFunction, StepBound
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .manipulation import Manipulation, Step, Stop
 from .model_hand import ModelHand
-from .qp import Bounds, Equality, Inequality, Squares
 from .plan import OneStep, Plan, Planner, Waypoint, WholeTurn
+from .qp import Bounds, Equality, Inequality, Squares
 from .reach import Reach, Reachability
 from .rehearsal import End, PathEnd
 from .safety import Guards, Safety, StoppingRule

@@ -92,7 +92,9 @@ class Bands:
         cov += np.diag((unit * self._knowledge.error.share * self._way) ** 2 + (unit * NOISE) ** 2)
         focus = controller.focus
         rows = focus.off_matrix[~focus.off_translation].numpy()
-        off_std = math.sqrt(max(float(np.linalg.eigvalsh(rows @ cov @ rows.T)[-1]), 0.0)) if len(rows) else 0.0
+        off_std = (
+            math.sqrt(max(float(np.linalg.eigvalsh(rows @ cov @ rows.T)[-1]), 0.0)) if len(rows) else 0.0
+        )
         off = focus.off_rotation(self._target.error(state))
         force = force_std = None
         if self._force is not None and piece.force is not None:

@@ -25,8 +25,8 @@ from .knowledge import HandKnowledge
 from .learned import Learned
 from .lessons import felt, learn, learn_forces
 from .manipulation import Manipulation, Step, Stop
-from .plan import OneStep, Plan, Planner, WholeTurn
 from .model_error import NOISE
+from .plan import OneStep, Plan, Planner, WholeTurn
 from .reach import Reach, Reachability, out_of_reach, reach, reachability
 from .safety import Safety
 from .safety.safety import Objection
@@ -203,6 +203,7 @@ class ClosedLoop:
         seen, halt = first.seen, first.halt
         self.controller.reset()
         self.knowledge.forces.begin()
+        self.knowledge.error.begin()
         self._figures.begin(seen.a)
         ends = Ends(self.safety.rule, target, self.controller.focus, seen)
         grips = turns = 0
@@ -230,7 +231,11 @@ class ClosedLoop:
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
                 more = ends.surprise + watch.suspects(seen)
-                return Stop(decision.status, seen, "; ".join(filter(None, (decision.message, plan.end.message))) + more)
+                return Stop(
+                    decision.status,
+                    seen,
+                    "; ".join(filter(None, (decision.message, plan.end.message))) + more,
+                )
             weak = "" if turns or firm else watch.weak(decision, seen)
             if weak:
                 return Stop(StopReason.WEAK_GRASP, seen, weak)
@@ -248,7 +253,9 @@ class ClosedLoop:
         while mean.status is PlantStatus.HELD and len(readings) < rule.most_looks:
             n, error = len(readings), ends.error(mean)
             doubt = watch.readings.pose_noise(seen, self.controller.focus) / math.sqrt(n)
-            if error > rule.tolerance + 3 * doubt or (n >= rule.looks and abs(error - rule.tolerance) > doubt):
+            if error > rule.tolerance + 3 * doubt or (
+                n >= rule.looks and abs(error - rule.tolerance) > doubt
+            ):
                 break
             another = watch.rest(seen, self.plant.observe())
             if another is seen:

@@ -146,9 +146,14 @@ class LookAndMoveController:
         a: Float[Tensor, " n_a"],
         fingertip_force: Float[Tensor, " n_pads"] | None,
         previous: tuple[Linearization, Tensor] | None = None,
+        *,
+        links: bool = False,
     ) -> Linearization:
         """The kinematic model with the forces that fingertips and ``previous`` forces, at other encoders,
         speak for.
+
+        Args:
+            links: those without a pad that touch bear, too.
 
         Raises:
             GraspError: the model refuses the grasp as it is.
@@ -157,8 +162,9 @@ class LookAndMoveController:
         if previous is not None:
             last, then = previous
             expected = last.forces_after(a - then)
+        contacts = self.kinematic.touching(state) if links else None
         lin = self.kinematic.linearize(
-            state, fingertip_force=fingertip_force, expected=expected, previous=last
+            state, contacts, fingertip_force=fingertip_force, expected=expected, previous=last
         )
         if self.forces is not None:
             rows, pads = self.kinematic.hand.pad_rows(lin.contacts.finger)
@@ -223,7 +229,9 @@ class LookAndMoveController:
         decision = self.choose(lin, seen)
         if self.bound is None or decision.status is not StopReason.RUNNING:
             return decision
-        asked = self.limiting.steps(scale * desired, travel * float(desired.norm() / focused.norm().clamp(1e-12)))
+        asked = self.limiting.steps(
+            scale * desired, travel * float(desired.norm() / focused.norm().clamp(1e-12))
+        )
         phi = self.bound.share(lin, decision.delta_a, decision.predicted, seen, asked)
         return decision if phi == 1 else self.choose(lin, dataclasses.replace(seen, desired=phi * desired))
 

@@ -13,6 +13,7 @@ from ..typing import Float, Tensor
 
 if TYPE_CHECKING:
     from ..model import Linearization
+    from .bands import Band
 
 
 class StopReason(Enum):
@@ -116,6 +117,8 @@ class Decision:
     """None: no forces are known, or no :class:`~torch_ekm.control.NormalForceLimit` asks for any."""
     turns: bool = True
     """Else it only grips."""
+    band: Band | None = None
+    """How sure the model is of the end; None: it is not known."""
 
     @property
     def linearization(self) -> Linearization | None:

@@ -37,9 +37,7 @@ class Ends:
     surprise = ""
     """The first reading that was believed though no motion explains it."""
 
-    def __init__(
-        self, rule: StoppingRule, target: PoseTarget, focus: FocusedPose, seen: Observation
-    ) -> None:
+    def __init__(self, rule: StoppingRule, target: PoseTarget, focus: FocusedPose, seen: Observation) -> None:
         check_kind("target", target, PoseTarget, A_TARGET)
         self.rule, self.target, self.focus, self._start = rule, target, focus, seen.state
         self.errors = [self.error(seen)]
@@ -59,7 +57,11 @@ class Ends:
             return Objection(StopReason.OBJECT_LOST)
         if self.focus.off_rotation(seen.state.minus(self._start)) > self.rule.off_limit:
             return Objection(StopReason.OBJECT_LOST, "dislocated off the focused axis")
-        if looks >= self.rule.looks and seen.status is PlantStatus.HELD and self.error(seen) <= self.rule.tolerance:
+        if (
+            looks >= self.rule.looks
+            and seen.status is PlantStatus.HELD
+            and self.error(seen) <= self.rule.tolerance
+        ):
             return Objection(StopReason.REACHED, self.leap)
         reason = self.rule.judge(self.errors, self.limited)
         return None if reason is StopReason.RUNNING else Objection(reason)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,10 +12,6 @@ from torch import nn
 from .._checks import check_finite, check_shape
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
-
-if TYPE_CHECKING:
-    from ..model import Linearization
-    from .pace import ForceSurprise
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _FURTHEST = 5.0  # priors: bounds of theta
@@ -84,7 +80,9 @@ class ForceSensitivity(Recorded, nn.Module):
         at = list(pads)
         return self.scale[at, None] * described + self.correction[at]
 
-    def spread(self, moved: Float[Tensor, " n_a"], said: Float[Tensor, " n_pads"]) -> Float[Tensor, " n_pads"]:
+    def spread(
+        self, moved: Float[Tensor, " n_a"], said: Float[Tensor, " n_pads"]
+    ) -> Float[Tensor, " n_pads"]:
         """``sqrt(u' P u + s^2)``: standard deviation of what is predicted for the change of each force [N].
 
         Args:

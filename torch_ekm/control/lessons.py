@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
 
-_NOISE, _OF_IT, _SURPRISES = 0.5, 0.25, 1.6  # [N]; share of what a finger bears; deviations that are a surprise
+_NOISE, _OF_IT, _SURPRISES = (
+    0.5,
+    0.25,
+    1.6,
+)  # [N]; share of what a finger bears; deviations that are a surprise
 
 
 class ForceSurprise(NamedTuple):
@@ -52,14 +56,21 @@ def felt(
     was, now = before.fingertip_force[pads], after.fingertip_force[pads]
     touched, touches = was >= least, now >= least
     surprise = (now - expected.normal[pads]).where(touched & touches, torch.nan)
-    return ForceSurprise(tuple(pads), (now - was).where(touched & touches, torch.nan), surprise, touched & ~touches)
+    return ForceSurprise(
+        tuple(pads), (now - was).where(touched & touches, torch.nan), surprise, touched & ~touches
+    )
 
 
-def learn_forces(hand: HandDescription, knowledge: HandKnowledge, expected: Expectation, felt: ForceSurprise) -> None:
+def learn_forces(
+    hand: HandDescription, knowledge: HandKnowledge, expected: Expectation, felt: ForceSurprise
+) -> None:
     """Pads that touched and measured before and after a movement teach how their forces answer."""
     change = torch.full_like(knowledge.forces.drift, torch.nan)
     change[list(felt.pads)] = felt.change
-    described, names = torch.zeros_like(knowledge.forces.correction), expected.pieces[0].linearization.contacts.finger
+    described, names = (
+        torch.zeros_like(knowledge.forces.correction),
+        expected.pieces[0].linearization.contacts.finger,
+    )
     rows, _ = hand.pad_rows(names)
     way = torch.stack([one.action.norm() for one in expected.pieces])
     for one, share in zip(expected.pieces, (way / way.sum().clamp(min=1e-12)).tolist(), strict=True):

@@ -34,6 +34,10 @@ class ModelError(Recorded, nn.Module):
         """s."""
         return math.sqrt(float(self.square))
 
+    def begin(self) -> None:
+        """A new turn: what slid in the last one is no part of it."""
+        self.square.clamp_(max=_START**2)
+
     def see(self, error: float, way: float) -> None:
         """Learn from one motion.
 

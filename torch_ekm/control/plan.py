@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
@@ -10,7 +11,6 @@ import torch
 
 from ..kinematics import GraspState
 from ..plant import Observation
-from ..typing import Tensor
 from .bands import Band, Bands
 from .decision import Decision, Piece, StopReason
 from .focus import FocusedPose, PoseTarget
@@ -173,7 +173,7 @@ class WholeTurn:
         if not waypoints:  # the model does not go anywhere from here: one step to first order
             decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
             return Plan(target, focus, seen.state, decision, end=end)
-        decision = self._decision(controller, rehearsal, seen, waypoints[:safe], against)
+        decision = self._movement(controller, seen, target, rehearsal, waypoints[:safe], against)
         return Plan(target, focus, seen.state, decision, tuple(waypoints), safe, end, against)
 
     def _against(self, band: Band, first: bool) -> str:
@@ -198,12 +198,29 @@ class WholeTurn:
             return None
         return _gripping(_joined(controller, seen, pieces, first))
 
-    def _decision(self, controller, rehearsal, seen, waypoints, against) -> Decision:
-        first = rehearsal.first
+    def _movement(
+        self,
+        controller: LookAndMoveController,
+        seen: Observation,
+        target: PoseTarget,
+        rehearsal: Rehearsal,
+        waypoints: list[Waypoint],
+        against: str,
+    ) -> Decision:
+        """To the last safe waypoint; where there is none one step to first order, if the object is where it
+        should be."""
+        first, focus = rehearsal.first, controller.focus
         assert first is not None
-        if not waypoints:
+        if waypoints:
+            pieces = [(one.piece, one.state) for one in waypoints]
+            return dataclasses.replace(_joined(controller, seen, pieces, first), band=waypoints[-1].band)
+        decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
+        if decision.status is not StopReason.RUNNING:
+            return decision
+        after = focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
+        if after > self.off_rotation:
             return controller.none(StopReason.GIVEN_UP, against, first.desired)
-        return _joined(controller, seen, [(one.piece, one.state) for one in waypoints], first)
+        return decision
 
 
 def _joined(controller, seen, pieces, first) -> Decision:
@@ -222,6 +239,4 @@ def _joined(controller, seen, pieces, first) -> Decision:
 
 
 def _gripping(decision: Decision) -> Decision:
-    import dataclasses
-
     return dataclasses.replace(decision, turns=False)

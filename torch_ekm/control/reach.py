@@ -12,7 +12,6 @@ import torch
 
 from .._checks import check_kind
 from ..exceptions import GraspError, ParameterError, SolverError
-from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Float, Tensor
 from .controller import LookAndMoveController
@@ -20,7 +19,7 @@ from .focus import A_TARGET, FocusedPose, PoseTarget
 from .limits import ActuatorLimit
 from .plan import Plan, WholeTurn
 from .qp import as_array, build_qp
-from .rehearsal import End, PathEnd
+from .rehearsal import End
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, OffAxisTask
 
@@ -30,7 +29,9 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _WEAK = 0.035  # of the largest gain: a direction that motors do not hold; those that they hold have .07
 _LEFT = 0.2  # of an error that the motors leave at the ends of their ranges, to decline it
-_OFF = 12 * _DEG  # [rad] off a focus without turns, from which a target is declined: 3 mm alone turn by 8 to 10
+_OFF = (
+    12 * _DEG
+)  # [rad] off a focus without turns, from which a target is declined: 3 mm alone turn by 8 to 10
 
 
 @dataclass(frozen=True)
@@ -80,9 +81,7 @@ class Reachability:
 
 
 @torch.no_grad()
-def reachability(
-    controller: LookAndMoveController, seen: Observation, target: PoseTarget
-) -> Reachability:
+def reachability(controller: LookAndMoveController, seen: Observation, target: PoseTarget) -> Reachability:
     """See :meth:`~torch_ekm.control.ClosedLoop.reachability`."""
     focus, error = controller.focus, check_kind("target", target, PoseTarget, A_TARGET).error(seen.state)
     lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)

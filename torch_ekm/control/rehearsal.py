@@ -27,6 +27,8 @@ _THERE = 0.1 * _DEG  # [rad] of the error, as a turn: the path ends
 _MOST = 60  # pieces
 LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is planned when it is there
 _GRIPPED = 0.95  # of the wanted grip
+import os
+LINKS = os.environ.get('LINKS', '1') == '1'
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
 _SLIDES = 0.05  # of its friction, that a pad at its limit has to spare
 
@@ -105,7 +107,7 @@ class Rehearsal:
                 return
             force = controller.believed(here.a, here.fingertip_force if self._measures else None)
             try:
-                lin = controller.linearize(here.state, here.a, force, previous)
+                lin = controller.linearize(here.state, here.a, force, previous, links=LINKS)
             except GraspError as failure:
                 self._failure = failure
                 return

@@ -343,7 +343,9 @@ class HandFigures(ParameterFilter):
         """``d(J_m w)/d theta`` of the object's rows ``(6, n)``; None: the model has no motion there."""
         return self._slopes(lin, pull, list(range(lin.n_q, lin.n_q + 6)), 0.0)
 
-    def _slopes(self, lin: Linearization, pull: Tensor, rows: list[int], by_width: Array | float) -> Array | None:
+    def _slopes(
+        self, lin: Linearization, pull: Tensor, rows: list[int], by_width: Array | float
+    ) -> Array | None:
         motion = None if lin.equations is None else self.solve(lin.equations)
         if motion is None:
             return None

@@ -11,7 +11,17 @@ from pathlib import Path
 from typing import Any
 
 from .._checks import check_kind
-from ..control import DEFAULT_LIMITS, DEFAULT_TASKS, Limit, PaceOptions, Safety, Task
+from ..control import (
+    DEFAULT_LIMITS,
+    DEFAULT_TASKS,
+    Limit,
+    LimitingFunction,
+    Planner,
+    Safety,
+    StepBound,
+    Task,
+    WholeTurn,
+)
 from ..description import list_hands
 from ..description.registry import file_digests
 from ..exceptions import ParameterError, UnknownNameError
@@ -21,7 +31,7 @@ from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
 
 #: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
 #: action: the increments accumulate on the set-point instead of the encoder, which learns nothing. "+S" is
-#: the servo inverse, on which the E-KM stands, too; the E-KM also learns the hand, and paces itself.
+#: the servo inverse, on which the E-KM stands, too; the E-KM also learns the hand, and plans whole turns.
 CONTROLLERS = ("KM", "KM+I", "KM+S", "E-KM")
 #: Seeds from here on are never used for tuning.
 FIRST_REPORTED = 1000
@@ -48,7 +58,10 @@ class Setting:
     model: ModelOptions = field(default_factory=ModelOptions)
     tasks: tuple[Task, ...] = DEFAULT_TASKS
     limits: tuple[Limit, ...] = DEFAULT_LIMITS
-    pace: PaceOptions = field(default_factory=PaceOptions)
+    limiting: LimitingFunction = field(default_factory=LimitingFunction)
+    bound: StepBound | None = field(default_factory=StepBound)
+    planner: Planner | None = None
+    """None: as a :class:`~torch_ekm.control.ClosedLoop` has it."""
     safety: Safety = field(default_factory=Safety)
     servo_inverse: bool = True
     """The E-KM commands through one; without it the dead zone is learned together with the hand."""
@@ -73,7 +86,7 @@ class Setting:
             if not getattr(self, name) > 0:
                 raise ParameterError(name, getattr(self, name), "positive")
         kinds = {"plant": PlantParameters, "config": PlantConfig, "model": ModelOptions}
-        kinds |= {"pace": PaceOptions, "safety": Safety}
+        kinds |= {"limiting": LimitingFunction, "safety": Safety}
         for name, kind in kinds.items():
             check_kind(name, self.parameters if name == "plant" else getattr(self, name), kind)
 
@@ -110,11 +123,12 @@ class Setting:
 
     def figures(self) -> dict[str, Any]:
         """All figures of plant, model, controller and learner, defaults included."""
+        parts = *self.tasks, *self.limits, self.limiting, self.bound, self.planner or WholeTurn(), self.safety
         return {
             "plant": dataclasses.asdict(self.parameters),
             "plant_config": dataclasses.asdict(self.config),
             "model": dataclasses.asdict(self.model),
-            "controller": [repr(part) for part in (*self.tasks, *self.limits, self.pace, self.safety)],
+            "controller": [repr(part) for part in parts],
             "learner": learner_figures(self.learner, self.capacity, **self.learner_options),
         }
 

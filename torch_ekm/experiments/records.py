@@ -87,8 +87,10 @@ class TrialRecord(Trial):
     poses: tuple[Any, ...] = ()
     """True joint angles [rad], position [m] and rotation before each motion and at the end, for pictures;
     empty unless they were asked for."""
-    retreats: int = 0
-    """Motions that undid an earlier one."""
+    turning: int = 0
+    """Movements that turn; the others only grip."""
+    simulated_s: float = 0.0
+    """From the first reading to the last, by the plant's clock [s]."""
 
     grasped: ClassVar[bool] = True
 
@@ -107,7 +109,7 @@ class TrialRecord(Trial):
 
     @property
     def steps(self) -> int:
-        """Number of motions, those that went back included."""
+        """Number of movements."""
         return len(self.seconds)
 
     @classmethod
@@ -141,7 +143,7 @@ class TrialRecord(Trial):
         short, moving = [], []
         for step, (before, after) in zip(steps, pairwise(measured), strict=True):
             asked = float(torch.linalg.vector_norm(step.decision.desired))
-            if not step.retreat:
+            if step.decision.turns:
                 short.append(abs(after - (before - asked)))
                 moving += [short[-1]] if asked >= _MOVING else []
         truth = [true_state(seen) for seen in (*(step.before for step in steps), done.stop.final)]
@@ -171,7 +173,8 @@ class TrialRecord(Trial):
             true_prediction_ekm_deg=true_errors("predicted") if learns else (),
             off_rotation_deg=off / _DEG,
             seconds=tuple(step.seconds for step in steps),
-            retreats=sum(step.retreat for step in steps),
+            turning=sum(step.decision.turns for step in steps),
+            simulated_s=done.stop.final.time - steps[0].before.time if steps else 0.0,
             poses=tuple([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in truth if poses),
         )
 

@@ -19,7 +19,7 @@ from ..control import (
     LimitingFunction,
     LookAndMoveController,
     Manipulation,
-    Pace,
+    OneStep,
     PoseTarget,
 )
 from ..description import ObjectDescription
@@ -44,13 +44,6 @@ _LEARNS_BY = (14.0, -8.0, 22.0)  # [deg] in this order
 _MOTIONS = 30  # at least, unless turns end early
 _MOST_TURNS = 12
 _FIRST_GRASP = 1000  # its number: never one that is tested
-
-
-class _Uncut(Pace):
-    """Every step is made as it was asked for."""
-
-    def cut(self, *decided: Any) -> float:
-        return 1.0
 
 
 class Bench:
@@ -83,7 +76,6 @@ class Bench:
         adapts = self.learns and setting.follows
         self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse, adapts=adapts)
         """Of the hand; it stays when the object changes."""
-        self.pace = Pace(setting.pace, adapts=self.learns)
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model)
         self.learner: ResidualLearner | None = None
         self.encoding: GraspEncoding | None = None
@@ -195,13 +187,13 @@ class Bench:
         limiting = LimitingFunction(gain=1.0, step=2 * step_deg * _DEG, contact_travel=None)
         wide = ActuatorLimit(step=20 * _DEG)
         limits = tuple(wide if isinstance(one, ActuatorLimit) else one for one in setting.limits)
-        pace = _Uncut(replace(setting.pace, limiting=limiting), adapts=False)
-        controller = LookAndMoveController(self._predictor, axis, setting.tasks, limits, pace)
+        controller = LookAndMoveController(
+            self._predictor, axis, setting.tasks, limits, limiting=limiting, bound=None
+        )
         rule = replace(setting.safety.rule, max_steps=1, off_limit=math.inf)
         safety = replace(setting.safety, rule=rule)
-        loop = ClosedLoop(
-            self.plant, controller, knowledge=self.knowledge, safety=safety, learn=False, decline=False
-        )
+        known = {"knowledge": self.knowledge, "safety": safety, "planner": OneStep()}
+        loop = ClosedLoop(self.plant, controller, **known, learn=False, decline=False)
         done = _whole(loop.run(PoseTarget.turned(start, axis, step_deg * _DEG)))
         asked, turned = step_deg, 0.0
         if done.steps:  # the last one: before it some may have tightened the grip
@@ -222,13 +214,15 @@ class Bench:
     def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
         """The controller of the next turn, with what is known now; by default about the hand's axis."""
         setting, focused = self.setting, self.hand.rotation_axis if focus is None else focus
-        return self.controllers(self._predictor, focused, setting.tasks, setting.limits, self.pace)
+        figures = {"limiting": setting.limiting, "bound": setting.bound}
+        return self.controllers(self._predictor, focused, setting.tasks, setting.limits, **figures)
 
     def closed_loop(
         self, plant: Plant, focus: FocusedPose | None = None, *, learn: bool = True, decline: bool = False
     ) -> ClosedLoop:
         """The loop of the next turn."""
-        known = {"knowledge": self.knowledge, "safety": self.setting.safety}
+        setting = self.setting
+        known = {"knowledge": self.knowledge, "safety": setting.safety, "planner": setting.planner}
         return self.loops(plant, self.look_and_move(focus), **known, learn=learn, decline=decline)
 
     def _prepare_learner(self, start: GraspState) -> None:

@@ -229,7 +229,7 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     except EKMError as error:
         yield Check("turn", "warning", str(error), remedy)
         return
-    found = ", ".join(f"{round(math.degrees(end.angle)):+d} deg ({end.ends_by})" for end in ends)
+    found = ", ".join(f"{round(math.degrees(end.angle)):+d} deg ({end.end})" for end in ends)
     little = min(abs(end.angle) for end in ends) < _LITTLE_TURN
     yield Check("turn", "warning" if little else "ok", f"predicted: {found}", remedy if little else "")
 

@@ -67,7 +67,7 @@ def _date(file: Path) -> str:
 
 def beliefs(knowledge: HandKnowledge) -> list[Belief]:
     """All figures of a :class:`~torch_ekm.control.HandKnowledge`, part by part."""
-    return [*_servo(knowledge), *_forces(knowledge), *_figures(knowledge), *_pace(knowledge)]
+    return [*_servo(knowledge), *_forces(knowledge), *_figures(knowledge), *_error(knowledge)]
 
 
 def _servo(knowledge: HandKnowledge) -> Iterator[Belief]:
@@ -101,7 +101,5 @@ def _figures(knowledge: HandKnowledge) -> Iterator[Belief]:
         )
 
 
-def _pace(knowledge: HandKnowledge) -> Iterator[Belief]:
-    pace = float(knowledge.pace)
-    note = "" if pace else "not known: the last turn did not reach its target"
-    yield Belief("pace", "last turn", "of the largest step", pace, None, None, note)
+def _error(knowledge: HandKnowledge) -> Iterator[Belief]:
+    yield Belief("error", "of the model", "share of a motion", knowledge.error.share, None, None, "")

@@ -111,9 +111,10 @@ def _reach(plant: SimulatedHand) -> View:
     controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
     loop = ClosedLoop(plant, controller)
     back, forth = (loop.reach(sign=sign) for sign in (-1, 1))
-    states = [*forth.path, *reversed(forth.path[:-1]), *back.path[1:], *reversed(back.path[:-1])]
+    one, other = forth.plan.states, back.plan.states
+    states = [*one, *reversed(one[:-1]), *other[1:], *reversed(other[:-1])]
     rows = tuple(
-        (name, f"{math.degrees(reach.angle):.1f}", reach.ends_by)
+        (name, f"{math.degrees(reach.angle):.1f}", str(reach.end))
         for name, reach in (("back", back), ("forth", forth))
     )
     header = ("direction", "angle [deg]", "ends by")

@@ -62,14 +62,11 @@ class FingertipWatch:
         lin = decision.linearization
         if lin is None or not lin.forces.solved:
             return None
-        estimate = lin.forces.normal
-        if seen.fingertip_force is not None:
-            pads = self.model.hand.pad_indices(lin.contacts.finger)
-            estimate = estimate.where(seen.fingertip_force[pads] < self.least, 0.0)
-        i = int(estimate.argmax())
-        if estimate[i] <= self.guards.force_ceiling:
-            return None
-        return self._too_hard(lin.contacts.finger[i], float(estimate[i]), "by the model's estimate")
+        for pad, estimate in self._normal(lin).items():
+            silent = seen.fingertip_force is None or float(seen.fingertip_force[pad]) < self.least
+            if silent and estimate > self.guards.force_ceiling:
+                return self._too_hard(self.pads[pad], estimate, "by the model's estimate")
+        return None
 
     def judge(self, before: Observation, decision: Decision, seen: Observation) -> Fingertips:
         """What is believed after a motion."""
@@ -147,8 +144,8 @@ class FingertipWatch:
             return {}
 
     def _normal(self, lin: Linearization) -> dict[int, float]:
-        pads = self.model.hand.pad_indices(lin.contacts.finger)
-        return dict(zip(pads, lin.forces.normal.tolist(), strict=True)) if lin.forces.solved else {}
+        rows, pads = self.model.hand.pad_rows(lin.contacts.finger)
+        return dict(zip(pads, lin.forces.normal[rows].tolist(), strict=True)) if lin.forces.solved else {}
 
     def _contradicts(self, force: float, expected: float) -> bool:
         variance = self.least**2 + _JOINT_STD**2 + (_JOINT_SHARE * expected) ** 2

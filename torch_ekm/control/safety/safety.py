@@ -147,8 +147,7 @@ class Guards:
 
 @dataclass(frozen=True)
 class Safety:
-    """Which readings count, and when the hand stops; the same for every controller that is compared.
-    """
+    """Which readings count, and when the hand stops; the same for every controller that is compared."""
 
     rule: StoppingRule = StoppingRule()
     """Reached, stalled, step limit, actuator limits, object lost."""
