@@ -141,37 +141,32 @@ class LookAndMoveController:
         return Expectation(moved, nominal, increment, deviation, tuple(made), normal)
 
     def linearize(
-        self,
-        state: GraspState,
-        a: Float[Tensor, " n_a"],
-        fingertip_force: Float[Tensor, " n_pads"] | None,
-        previous: tuple[Linearization, Tensor] | None = None,
-        *,
-        links: bool = False,
+        self, state: GraspState, a: Float[Tensor, " n_a"], fingertip_force: Float[Tensor, " n_pads"] | None
     ) -> Linearization:
-        """The kinematic model with the forces that fingertips and ``previous`` forces, at other encoders,
-        speak for.
-
-        Args:
-            links: those without a pad that touch bear, too.
+        """The kinematic model with the forces that fingertips and the last forces speak for.
 
         Raises:
             GraspError: the model refuses the grasp as it is.
         """
         last, expected = None, None
-        if previous is not None:
-            last, then = previous
+        if self.previous is not None:
+            last, then = self.previous
             expected = last.forces_after(a - then)
-        contacts = self.kinematic.touching(state) if links else None
         lin = self.kinematic.linearize(
-            state, contacts, fingertip_force=fingertip_force, expected=expected, previous=last
+            state, fingertip_force=fingertip_force, expected=expected, previous=last
         )
-        if self.forces is not None:
-            rows, pads = self.kinematic.hand.pad_rows(lin.contacts.finger)
-            corrected = lin.normal_force_sensitivity.clone()
-            corrected[rows] = self.forces.corrected(corrected[rows], pads)
-            lin = lin.with_normal_sensitivity(corrected)
-        return lin
+        if lin.forces.solved:
+            self.previous = lin, a
+        return self.corrected(lin)
+
+    def corrected(self, lin: Linearization) -> Linearization:
+        """With what was learned of how the pads' forces answer."""
+        if self.forces is None:
+            return lin
+        rows, pads = self.kinematic.hand.pad_rows(lin.contacts.finger)
+        corrected = lin.normal_force_sensitivity.clone()
+        corrected[rows] = self.forces.corrected(corrected[rows], pads)
+        return lin.with_normal_sensitivity(corrected)
 
     def _joint_force(self, lin: Linearization) -> Tensor | None:
         """Normal forces without the pads', where these leave a torque of the joints unexplained."""
@@ -212,7 +207,7 @@ class LookAndMoveController:
         error = self._error(state, target)
         focused = self.focus.matrix @ error
         try:
-            lin = self.linearize(state, a, force, self.previous)
+            lin = self.linearize(state, a, force)
         except NoContactError as failure:
             if self.previous is not None or force is None:
                 return self.none(StopReason.OBJECT_LOST, failure, focused)
@@ -220,8 +215,6 @@ class LookAndMoveController:
             return self.none(StopReason.UNSTABLE_GRASP, held, focused)
         except GraspError as failure:
             return self.none(StopReason.UNSTABLE_GRASP, failure, focused)
-        if lin.forces.solved:
-            self.previous = lin, a
         travel = contact_travel(self.focus.matrix.mT @ focused, lin.contacts.point - state.position)
         scale = self.focus.step_scale
         desired = self.limiting(scale * focused, travel) / scale

@@ -62,8 +62,9 @@ class ModelHand:
         self._way = self.a.new_zeros(self.hand.n_a)
         self.increment = self.correction = self.a.new_zeros(self.state.n_s)
         """Of the last motion, and g's part of it [rad, m, rad]."""
+        self._measured, self._stands = force is not None, False
         self.force = self.a.new_zeros(len(self.hand.pads)) if force is None else force
-        self._begin(force)
+        self._stand()
         return self.observe()
 
     def observe(self) -> Observation:
@@ -75,6 +76,7 @@ class ModelHand:
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the encoders by ``delta_a`` [rad], as far as their ranges allow."""
         way = (self.a + delta_a).clamp(self._a_min, self._a_max) - self.a
+        self._stand()
         if self._motion is not None and not self.failure:
             self._move(way, self._motion)
         self.time += 1.0
@@ -84,6 +86,7 @@ class ModelHand:
     def linearization(self) -> Linearization | None:
         """At the present state, contacts doing what they do in another motion like the last one; None where
         the model refuses."""
+        self._stand()
         if self._linearization is None and self._motion is not None:
             with contextlib.suppress(GraspError):
                 self._linearization = self._motion.linearize(self._way)
@@ -106,10 +109,13 @@ class ModelHand:
         ends = (self.a <= self._a_min + _NEAR_END) | (self.a >= self._a_max - _NEAR_END)
         return [self.hand.actuator_names[i] for i in torch.nonzero(ends).flatten().tolist()]
 
-    def _begin(self, force: Tensor | None) -> None:
-        """Go on from the state as from a reading with these normal forces [N]."""
+    def _stand(self) -> None:
+        """Go on from the state as from a reading with these normal forces [N], if that is to be done yet."""
+        if self._stands:
+            return
+        self._stands = True
         try:
-            contacts = self.kinematic.touching(self.state)
+            contacts, force = self.kinematic.touching(self.state), self.force if self._measured else None
             lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
             if not lin.forces.solved:
                 self.failure = GraspEndsError(str(lin.doubts[0]))
@@ -141,4 +147,4 @@ class ModelHand:
             bear = (before > least) & (force > least)
             learned = before + self._forces.scale * (force - before) + self._forces.correction @ w
             self.force = force.where(~bear, learned.clamp(min=least))
-            self._begin(self.force)
+            self._measured, self._stands = True, False

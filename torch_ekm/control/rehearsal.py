@@ -27,8 +27,6 @@ _THERE = 0.1 * _DEG  # [rad] of the error, as a turn: the path ends
 _MOST = 60  # pieces
 LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is planned when it is there
 _GRIPPED = 0.95  # of the wanted grip
-import os
-LINKS = os.environ.get('LINKS', '1') == '1'
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
 _SLIDES = 0.05  # of its friction, that a pad at its limit has to spare
 
@@ -96,8 +94,7 @@ class Rehearsal:
     @torch.no_grad()
     def pieces(self) -> Iterator[tuple[Piece, GraspState]]:
         """Each piece, and where it leads."""
-        controller, hand = self._controller, self.hand
-        previous, way = controller.previous, torch.zeros_like(hand.a)
+        controller, hand, way = self._controller, self.hand, torch.zeros_like(self.hand.a)
         for _ in range(_MOST):
             if hand.failure is not None:
                 self._failure = hand.failure
@@ -106,12 +103,10 @@ class Rehearsal:
             if self._there(here.state):
                 return
             force = controller.believed(here.a, here.fingertip_force if self._measures else None)
-            try:
-                lin = controller.linearize(here.state, here.a, force, previous, links=LINKS)
-            except GraspError as failure:
-                self._failure = failure
+            if hand.linearization is None:
+                self._failure = hand.failure
                 return
-            previous = (lin, here.a) if lin.forces.solved else previous
+            lin = controller.corrected(hand.linearization)
             self.last = decision = self._decide(here, force, lin)
             self.first = self.first or decision
             if decision.status is not StopReason.RUNNING or (self._target is None and _gripped(decision)):
