@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ..kinematics import GraspState
-from ..typing import Float, Tensor
+from ..typing import Array, Float, Tensor
 from .model_error import NOISE
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ class Band:
 class Bands:
     """Standard deviations along a path, from its beginning::
 
-        Sigma = G P G' + (sum sd_g)^2 + (s way)^2 + n^2,   G = sum d(J_m w)/d figures
+        Sigma = G P G' + (sum sd_g)^2 + s^2 way^2 + n^2,   G = sum d(J_m w)/d figures
         sd_f^2 = s_f^2 + u' P_f u + (0.15 sum |df_n|)^2
 
     of the object's motion: covariance P of the hand's figures, deviation sd_g of g, share s of
@@ -68,7 +68,7 @@ class Bands:
         self._start, n_pads = seen.state, len(controller.kinematic.hand.pads)
         self._force = seen.fingertip_force
         self._figures = np.zeros((6, 0))
-        self._g, self._way = np.zeros(6), 0.0
+        self._g, self._way = np.zeros(6), np.zeros(3)
         self._pull = torch.zeros_like(seen.a)
         self._said = torch.zeros(n_pads, dtype=torch.float64)  # S w
         self._swing = torch.zeros(n_pads, dtype=torch.float64)  # sum |df|
@@ -78,7 +78,7 @@ class Bands:
         """One more piece, which leads to a state."""
         controller, hand = self._controller, self._controller.kinematic.hand
         twist, lin = piece.increment[-6:].numpy(), piece.linearization
-        self._way += math.sqrt(twist[3:] @ twist[3:] + twist[:3] @ twist[:3] / _LEVER**2 * 0)
+        self._way = self._way + twist[3:]
         self._pull = self._pull + piece.action
         if controller.enhanced is not None:
             _, variance = controller.enhanced.correction(piece.state, piece.action, state.n_s)
@@ -88,8 +88,7 @@ class Bands:
         if slopes is not None:
             self._figures = self._figures + slopes if self._figures.size else slopes
             cov += self._figures @ self._knowledge.figures.covariance.numpy() @ self._figures.T
-        unit = np.array([_LEVER] * 3 + [1.0] * 3)
-        cov += np.diag((unit * self._knowledge.error.share * self._way) ** 2 + (unit * NOISE) ** 2)
+        cov += self._of_model()
         focus = controller.focus
         rows = focus.off_matrix[~focus.off_translation].numpy()
         off_std = (
@@ -110,3 +109,12 @@ class Bands:
             spread = self._knowledge.forces.spread(self._pull, self._said)
             force_std = (spread.square() + (_SHARE * self._swing).square()).sqrt()
         return Band(off, off_std, torch.from_numpy(np.sqrt(cov.diagonal())), force, force_std)
+
+    def _of_model(self) -> Array:
+        """Covariance of what neither figures nor g know: shares of the way, and noise."""
+        error, size = self._knowledge.error, float(np.linalg.norm(self._way))
+        axis = self._way / max(size, 1e-12)
+        turn = (error.across * size) ** 2 * np.eye(3) + NOISE**2 * np.eye(3)
+        turn += (error.along**2 - error.across**2) * size**2 * np.outer(axis, axis)
+        shift = (_LEVER * error.across * size) ** 2 * np.eye(3) + (_LEVER * NOISE) ** 2 * np.eye(3)
+        return np.block([[shift, np.zeros((3, 3))], [np.zeros((3, 3)), turn]])

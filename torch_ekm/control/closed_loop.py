@@ -326,9 +326,8 @@ class ClosedLoop:
             expected = controller.expect(decision.pieces, self._figures.pulled(moved))
         increment = after.state.minus(seen.state)
         if decision.turns:
-            off = float(torch.linalg.vector_norm((increment - expected.increment)[-3:]))
-            way = float(torch.linalg.vector_norm(expected.increment[-3:]))
-            if off > _SLIPS * (2**0.5 * NOISE + _SHARE * way):
+            off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
+            if float(off.norm()) > _SLIPS * (2**0.5 * NOISE + _SHARE * float(way.norm())):
                 controller.tighter += _SLIP
             if self.learn:
                 knowledge.error.see(off, way)

@@ -10,48 +10,61 @@ import torch
 from torch import nn
 
 from .._recorded import Recorded, bound_problems
+from ..typing import Float, Tensor
 
-_START = 0.2  # of a hand of which nothing is known
+_START = 0.1, 0.2  # along and across, of a hand of which nothing is known
 _RECENT = 0.25  # weight of the last motion,
 _WHOLE = math.radians(2.5)  # if it is as long as this [rad]
-NOISE = math.radians(0.5)  # [rad] of a motion as measured: two poses, and a pad that creeps as it settles
+NOISE = math.radians(0.4)  # [rad] of a motion as measured: two poses, and a pad that creeps as it settles
 
 
 class ModelError(Recorded, nn.Module):
-    """``s^2 <- s^2 + c (clip((|e|^2 - 2 n^2) / way^2, 0, 1) - s^2), c = min(1, (way/2.5 deg)^2) / 4``.
+    """``s_i^2 <- s_i^2 + c (clip((e_i^2 - n^2) / way^2, 0, 1) - s_i^2), c = min(1, (way/2.5 deg)^2) / 4``.
 
-    e is the rotation of the object that a model of ``f + g`` did not predict, n = 0.5 deg the part of it that
-    has nothing to do with the way. One figure for a hand and what it holds: slides, figures that are not
-    known, terms that the model leaves out. Variances of figures and of g are added where they are known.
+    e is the rotation of the object that a model of ``f + g`` did not predict: along its way, and square to it.
+    n = 0.4 deg is the part that has nothing to do with the way. Two figures for a hand and what it holds: for
+    slides, figures that are not known, terms that the model leaves out. Variances of figures and of g are
+    added where they are known.
     """
 
     def __init__(self) -> None:
         super().__init__()
-        self.square = nn.Buffer(torch.tensor(_START**2, dtype=torch.float64))
+        self.square = nn.Buffer(torch.tensor([along**2 for along in _START], dtype=torch.float64))
+        """s^2, along and across."""
 
     @property
-    def share(self) -> float:
-        """s."""
-        return math.sqrt(float(self.square))
+    def along(self) -> float:
+        """s of the rotation about its own axis."""
+        return math.sqrt(float(self.square[0]))
+
+    @property
+    def across(self) -> float:
+        """s of the rotation off it."""
+        return math.sqrt(float(self.square[1]))
 
     def begin(self) -> None:
         """A new turn: what slid in the last one is no part of it."""
-        self.square.clamp_(max=_START**2)
+        self.square.copy_(torch.minimum(self.square, self.square.new_tensor(_START).square()))
 
-    def see(self, error: float, way: float) -> None:
-        """Learn from one motion.
+    def see(self, error: Float[Tensor, " 3"], way: Float[Tensor, " 3"]) -> None:
+        """Learn from one movement.
 
         Args:
-            error: ``|e|`` [rad].
+            error: e, measured less predicted [rad].
             way: predicted rotation [rad].
         """
-        if way > 0:
-            share = min(max(error**2 - 2 * NOISE**2, 0.0) / way**2, 1.0)
-            self.square += _RECENT * min(1.0, (way / _WHOLE) ** 2) * (share - self.square)
+        size = float(torch.linalg.vector_norm(way))
+        if size == 0:
+            return
+        along = float(error @ way) / size
+        across = max(float(error @ error) - along**2, 0.0) / 2  # of each of two directions
+        found = self.square.new_tensor([along**2, across])
+        share = ((found - NOISE**2) / size**2).clamp(0, 1)
+        self.square += _RECENT * min(1.0, (size / _WHOLE) ** 2) * (share - self.square)
 
     def state_problems(self, state: Mapping[str, Any]) -> list[str]:
         """What is wrong with the entries of a state that is to be loaded."""
         return bound_problems(state, square=(0, 1))
 
     def extra_repr(self) -> str:
-        return f"share={self.share:.2g}"
+        return f"along={self.along:.2g}, across={self.across:.2g}"

@@ -49,11 +49,11 @@ class FocusTask:
 class OffAxisTask:
     """The object stays where it is, and comes back, in the directions that the focus leaves free."""
 
-    rotation_weight: float = 1.0
+    rotation_weight: float = 4.0
     """Per deg^2."""
     translation_weight: float = 0.05
     """Per mm^2."""
-    rotation_step: float = 0.5 * DEGREE
+    rotation_step: float = 1.0 * DEGREE
     translation_step: float = 0.5e-3
     """How much of the error is corrected in one step: [rad], [m]."""
 

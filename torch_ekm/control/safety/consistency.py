@@ -20,7 +20,7 @@ from .readings import ReadingTests, deg
 from .safety import Objection
 
 if TYPE_CHECKING:
-    from ...model import KinematicModel
+    from ...model import KinematicModel, Linearization
 
 _DEG = math.pi / 180
 _NOWHERE = 0.5 * _DEG  # an encoder moves less in a motion in which its motor is sent nowhere
@@ -116,7 +116,7 @@ class Consistency:
                 "'torch-ekm check --plant'",
                 False,
             )  # fmt: skip
-            rate, sure = self._drift(before, seen, expected.moved, expected.described)
+            rate, sure = self._drift(before, seen, expected)
             i = int(abs(sure).argmax())
             tests["driven"] = Row(
                 float(abs(sure[i]) * (abs(rate[i]) > _DRIFTS)), _SURE, 1, StopReason.ENCODER_DRIFT,
@@ -128,14 +128,15 @@ class Consistency:
         return tests
 
     def _drift(
-        self, before: Observation, seen: Observation, moved: Tensor, described: Tensor
+        self, before: Observation, seen: Observation, expected: Expectation
     ) -> tuple[Array, Array]:
         """beta of each actuator [rad], and its size in standard deviations, by Bayesian least squares on what
         the hand as described predicts: what is learned of it changes meanwhile."""
-        n_q, w = self.hand.n_q, moved.numpy()
+        n_q, w = self.hand.n_q, expected.moved.numpy()
         came = seen.state.minus(before.state)
-        e = self.hand.actuation_jacobian @ (described - came).numpy()[:n_q]
-        self._sums += np.stack([np.ones_like(w), w, w * w, e, w * e, e * e])
+        e = self.hand.actuation_jacobian @ (expected.described - came).numpy()[:n_q]
+        if not any(self._bears(one.linearization) for one in expected.pieces):
+            self._sums += np.stack([np.ones_like(w), w, w * w, e, w * e, e * e])
         n, w, ww, e, we, ee = self._sums
         beta, std, variance = 0 * n, 0 * n, np.full_like(n, _REST_STD**2)
         for _ in range(2):  # the second time with the noise that the first one leaves
@@ -150,6 +151,11 @@ class Consistency:
         bias = self.servo.bias.numpy()
         surer = np.where((abs(bias) > _BIAS) & (bias * beta > 0), _BOTH, 1.0)
         return beta, np.where(judged, surer * beta / std, 0.0)
+
+    def _bears(self, lin: Linearization) -> bool:
+        """A link without a pad, or a stop: the joints do not follow the encoders as described."""
+        rows, _ = self.hand.pad_rows(lin.contacts.finger)
+        return len(rows) < len(lin.contacts.finger) or bool(lin.held_joints.any())
 
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
