@@ -31,7 +31,8 @@ class Path:
     def __post_init__(self) -> None:
         for name in ("waypoints", "times"):
             value = torch.as_tensor(getattr(self, name)).detach().to("cpu", torch.float64)
-            object.__setattr__(self, name, check_finite(name, value))
+            check_finite(name, value)
+            object.__setattr__(self, name, value)
         if self.waypoints.ndim != 2 or not len(self.waypoints):
             raise ShapeError("waypoints", "(n, n_a), n of 1 or more", tuple(self.waypoints.shape))
         if self.times.shape != self.waypoints.shape[:1]:
