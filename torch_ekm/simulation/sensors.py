@@ -81,13 +81,13 @@ class Sensors:
 
     def agree(self, one: TimedState, other: TimedState) -> bool:
         """Whether two frames differ by their noise: joints, and pose, each by the mean square of what they
-        differ, in standard deviations, up to two of its own above its mean."""
+        differ, in standard deviations, up to one of its own above its mean."""
         turned = log(torch.from_numpy(other.rotation @ one.rotation.T)).numpy()
         p = self._p
         angle, length = max(p.rotation_noise, _LEAST_ANGLE), max(p.position_noise, _LEAST_LENGTH)
         pose = np.concatenate([turned / angle, (other.position - one.position) / length])
         joints = (other.q - one.q) / max(p.joint_noise, _LEAST_ANGLE)
-        return all(np.mean(z**2) / 2 <= 1 + 2 * np.sqrt(2 / len(z)) for z in (pose, joints))
+        return all(np.mean(z**2) / 2 <= 1 + np.sqrt(2 / len(z)) for z in (pose, joints))
 
     def joints(self, q: Array, generator: np.random.Generator) -> Array:
         """Joint angles ``(n_q,)`` [rad] with noise; those of stuck channels do not change."""

@@ -20,6 +20,7 @@ from ..sensors import TimedState
 from .scene import make_scene
 
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
+_OFTEN = 0.01  # [s] between two states that a late camera may show
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
 _RATE_LIMIT = 100 * np.pi / 180  # fastest motion of a motor [rad/s]
 _SPIN_UP = 0.02  # [s] until it runs so fast: the mechanical time constant of small geared motors
@@ -46,7 +47,7 @@ class Rig:
         hand, obj: the bodies.
         config: time steps and rates.
         parameters: what they really are.
-        remember: called every 10 steps if the camera is late.
+        remember: called every 0.01 s if the camera is late.
         engine: which physics, one of :data:`ENGINES`.
         native: the engine runs the tendons, which change no more.
     """
@@ -167,7 +168,7 @@ class Rig:
         normal = np.zeros(len(self.hand.pads))
         fingers: set[int] = set()
         window = min(_FORCE_WINDOW, steps)
-        begun = round(self.time / self.config.time_step)
+        begun, often = round(self.time / self.config.time_step), max(1, round(_OFTEN / self.config.time_step))
         for k in range(1, steps + 1):
             output = servo.move_to(motor_at(k / steps))
             if push is not None:
@@ -177,7 +178,7 @@ class Rig:
             else:
                 q = scene.next_q if transmission.stiff else scene.q
                 scene.step(transmission.drive_targets(q, output))
-            if self.parameters.latency > 0 and (begun + k) % _FORCE_WINDOW == 0:
+            if self.parameters.latency > 0 and (begun + k) % often == 0:
                 self.remember(self.state._replace(time=self.time + k * self.config.time_step))
             if k > steps - window:
                 touches = scene.touches()
