@@ -80,7 +80,7 @@ def check_residual_learner(
 
 
 def check_following_plant(plant: FollowingPlant, path: Path, *, tolerance: float) -> None:
-    """Assert what the contract says of ``follow``: along ``path``, and on the way back until the first reading.
+    """Assert what the contract says of ``follow``: along ``path``, and back until the first reading.
 
     Args:
         plant: opened, with room for the path, which takes several periods of its sensors.

@@ -130,12 +130,12 @@ def test_a_reading_that_is_none_and_a_watcher_that_fails_end_the_movement(fault,
     gate = Gate(plant, HAND)
     gate.observe()
     if fault == "reading":
-        plant.change = lambda seen: dataclasses.replace(seen, time=math.nan) if 0 < seen.a[0] else seen
+        plant.change = lambda seen: dataclasses.replace(seen, time=math.nan) if seen.a[0] > 0 else seen
 
     def watch(seen) -> bool:
         raise EKMError("no picture")
 
-    with pytest.raises(EKMError, match="Observation.time|no picture"):
+    with pytest.raises(EKMError, match=r"Observation\.time|no picture"):
         gate.follow(Path.through(WAY, 50 * DEG), always if fault == "reading" else watch)
     assert isinstance(gate.failure, EKMError)
     assert float(plant.a[0]) < 20.1 * DEG

@@ -55,7 +55,9 @@ def test_motors_go_straight_between_waypoints_and_no_faster_than_they_can() -> N
         plant, passed = hand("none", frame_rate=100.0), []
         start = plant.observe()
         way = -2 * WAY[:2]
-        after = plant.follow(Path.through(way, asked * DEG), lambda seen: passed.append(seen) or True)
+        after = plant.follow(
+            Path.through(way, asked * DEG), lambda seen, passed=passed: passed.append(seen) or True
+        )
         a = torch.stack([seen.a for seen in passed])[:, 0] - start.a[0]
         rate = -(a.diff() / DEG / 0.01)[2:-2]
         assert float(rate.max()) == pytest.approx(speed, rel=1e-6)

@@ -12,7 +12,7 @@ from ..kinematics.se3 import exp, log
 from ..typing import Array
 from .parameters import PlantParameters
 
-_LEAST_ANGLE, _LEAST_LENGTH = np.radians(0.02), 2e-5  # [rad, m] deviation of a sensor without noise
+_LEAST_ANGLE, _LEAST_LENGTH = np.radians(0.002), 2e-6  # [rad, m] taken for a sensor without noise
 
 
 class TimedState(NamedTuple):
