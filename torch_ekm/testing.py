@@ -103,9 +103,9 @@ def check_following_plant(plant: FollowingPlant, path: Path, *, tolerance: float
     back = torch.cat([goals.flip(0)[1:], torch.zeros_like(goals[:1])]) - goals[-1]
     asked: list[Observation] = []
     way = Path(back, path.durations.flip(0).cumsum(0))
-    left = float((plant.follow(way, lambda seen: asked.append(seen)).a - start.a).abs().max())
-    assert len(asked) == 1, "watch is asked again after it has not answered True"
-    assert left > tolerance, "the motors go on where watch does not answer True"
+    left = float((plant.follow(way, lambda seen: bool(asked.append(seen))).a - start.a).abs().max())
+    assert len(asked) == 1, "watch is asked again after it has answered False"
+    assert left > tolerance, "the motors go on where watch answers False"
     wrong = Path(torch.zeros(1, goals.shape[1] + 1), torch.ones(1))
     _raises(lambda: plant.follow(wrong, lambda seen: True), EKMError, "waypoints of another hand")
 
