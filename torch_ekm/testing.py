@@ -1,4 +1,4 @@
-"""Checks for authors of learners: the contract as one call, ``check_residual_learner(factory)``."""
+"""Checks for authors of learners and drivers: a contract as one call, ``check_residual_learner(factory)``."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 from .exceptions import EKMError, NonFiniteError, NoStateError, ParameterError, ShapeError, StateMismatchError
+from .plant import FollowingPlant, Observation, Path
 from .residual.base import ResidualLearner, UpdateReport
 
-__all__ = ["check_residual_learner"]
+__all__ = ["check_following_plant", "check_residual_learner"]
 
 QUERY_SHAPES = ((), (1,), (5,), (2, 3))
 
@@ -76,6 +77,37 @@ def check_residual_learner(
         _check_prior(learner, x)
         _check_reset(learner, factory, x)
         _check_bounds(learner)
+
+
+def check_following_plant(plant: FollowingPlant, path: Path, *, tolerance: float) -> None:
+    """Assert what the contract says of ``follow``: along ``path``, and back until the first reading.
+
+    Args:
+        plant: opened, with room for the path, which takes several periods of its sensors.
+        tolerance: how far from a set-point the motors may stop, by dead zones and biases [rad]; shorter than
+            the path.
+
+    Raises:
+        AssertionError: naming the first clause that is violated.
+    """
+    passed: list[Observation] = []
+    goals, start = path.waypoints, plant.observe()
+    end = plant.follow(path, lambda seen: passed.append(seen) or True)
+    times = [seen.time for seen in (start, *passed, end)]
+    assert passed, "no reading on the way is given to watch"
+    assert times == sorted(times), "readings on the way are not in the order of time"
+    off = float((end.a - start.a - goals[-1]).abs().max())
+    assert off <= tolerance, f"the motors end {off:.3g} rad from the last waypoint"
+    later = float((plant.observe().a - end.a).abs().max())
+    assert later <= tolerance, f"the motors move on by {later:.3g} rad after follow has returned"
+    back = torch.cat([goals.flip(0)[1:], torch.zeros_like(goals[:1])]) - goals[-1]
+    asked: list[Observation] = []
+    way = Path(back, path.durations.flip(0).cumsum(0))
+    left = float((plant.follow(way, lambda seen: bool(asked.append(seen))).a - start.a).abs().max())
+    assert len(asked) == 1, "watch is asked again after it has answered False"
+    assert left > tolerance, "the motors go on where watch answers False"
+    wrong = Path(torch.zeros(1, goals.shape[1] + 1), torch.ones(1))
+    _raises(lambda: plant.follow(wrong, lambda seen: True), EKMError, "waypoints of another hand")
 
 
 def _stream(learner: ResidualLearner, n: int) -> tuple[Tensor, Tensor]:

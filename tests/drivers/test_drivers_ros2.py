@@ -19,6 +19,8 @@ from wirings import of_page, write
 
 from torch_ekm.drivers import Ros2Plant, RosPose, WithPose
 from torch_ekm.exceptions import BusError, DescriptionError, StaleReadingError
+from torch_ekm.plant import Path as Waypoints
+from torch_ekm.testing import check_following_plant
 
 ROS2 = next(bus for bus in BUSES if bus.kind == "ros2")
 TEXT = """\
@@ -285,3 +287,21 @@ def test_one_hand_has_one_master(robot, path) -> None:
     time.sleep(0.3)
     with pytest.raises(BusError, match="node /rqt commands there, too"):
         Ros2Plant(path)
+
+
+def test_a_movement_over_ros_completes_stops_and_ends_where_nothing_new_comes(hand, path) -> None:
+    waypoints = torch.tensor([[0.2, -0.2], [0.3, 0.0]], dtype=torch.float64)
+    with Ros2Plant(path) as plant:
+        check_following_plant(plant, Waypoints.through(waypoints, 1.0), tolerance=0.01)
+        asked = []
+
+        def watch(seen) -> bool:
+            asked.append(seen)
+            if len(asked) == 3:
+                hand.ask("pull silent")
+            return True
+
+        long = torch.cat([waypoints, 0 * waypoints, waypoints, 0 * waypoints])
+        with pytest.raises(StaleReadingError, match="motors"):
+            plant.follow(Waypoints.through(long, 1.0), watch)
+        hand.ask("plug")

@@ -15,6 +15,7 @@ import torch
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.drivers import BusReading, HandDriver, Sighting, Wiring, WithPose
 from torch_ekm.inspection.check_plant import check_plant
+from torch_ekm.inspection.row import Check
 from torch_ekm.kinematics import ActuationMap
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
 
@@ -319,6 +320,30 @@ def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
     assert "the wiring file names the hand" in str(done.exception)
     done = CliRunner().invoke(app, ["check"])
     assert "--plant" in str(done.exception)
+
+
+def test_a_driver_that_follows_is_to_give_readings_on_the_way(tmp_path) -> None:
+    plant = bench(tmp_path)
+
+    def row() -> Check:
+        return next(one for one in check_plant(plant, plant.hand) if one.name == "follow")
+
+    assert row().state == "ok"
+    assert int(re.search(r"(\d+) readings on the way", row().found)[1]) >= 1
+    plant.follow = lambda path, watch: plant.observe()
+    assert row().state == "warning"
+    plant.follow = lambda path, watch: watch(None)
+    assert row().state == "error"
+    bare = OnlyTheContract(plant)
+    assert not [one for one in check_plant(bare, plant.hand) if one.name == "follow"]
+
+
+class OnlyTheContract:
+    def __init__(self, plant: HandDriver) -> None:
+        self.reset, self.observe, self.command = plant.reset, plant.observe, plant.command
+
+    def close(self) -> None:
+        pass
 
 
 def test_a_transposed_rotation_of_a_held_object() -> None:

@@ -96,14 +96,14 @@ def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
         rig = plant._grasped()
         rig.scene.object_pose = (np.array([0.0, 0.0, 1.0]), np.eye(3))
         rig.scene.hold_object(True)
-        rig.move(np.array([0.5, 0.8]))
+        rig.follow(np.array([[0.5, 0.8]]), np.zeros(1))
         rig.wait(2.0)
         q, hand = rig.scene.q, plant.hand
         stretch = np.array([0.5, 0.8]) - hand.actuation_jacobian @ q
         torque = hand.actuation_jacobian.T @ (np.array([a.stiffness for a in hand.actuators]) * stretch)
         np.testing.assert_allclose(hand.spring_stiffness * (q - hand.spring_rest), torque, atol=1e-4)
         rig.transmission.lengthen(0.5)  # slack: a tendon does not push
-        rig.move(np.zeros(2))
+        rig.follow(np.zeros((1, 2)), np.zeros(1))
         rig.wait(2.0)
         np.testing.assert_allclose(rig.scene.q, hand.spring_rest, atol=1e-3)
 

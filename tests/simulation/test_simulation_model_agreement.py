@@ -71,7 +71,9 @@ def motion_error(plant, linear, actuators) -> float:
             plant.restore(snapshot)
             delta = torch.zeros(plant.hand.n_a, dtype=torch.float64)
             delta[k] = sign * STEP
-            ends.append(plant.command(delta).truth)
+            plant.command(delta)
+            plant.wait(0.5)  # to a hundredth of this motion: more than is worth waiting for otherwise
+            ends.append(plant.observe().truth)
         plus, minus = ends
         column = [plus.position - minus.position, log(plus.rotation @ minus.rotation.mT) * 0.03]
         measured.append(torch.cat(column).numpy() / (2 * STEP))

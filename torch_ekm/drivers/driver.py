@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import time
 from abc import ABC, abstractmethod
@@ -15,12 +16,14 @@ from .._checks import check_finite, check_shape
 from ..description import HandDescription
 from ..exceptions import BusError, CommandRefusedError, NeverAtRestError, StaleReadingError
 from ..plant import Observation, PlantStatus, Stamps
+from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
 from .posture import Posture
 from .wiring import Channel, Wiring
 
 _REACH = 0.08  # [s] a motion goes out in pieces of so much: a hand whose computer dies goes no farther
 _LEAD = 0.005  # [s] a piece is sent before the end of the one under way: the motors do not stop in between
+_BLIND = 0.3  # [s] without a new reading of the motors a motion goes no farther
 _POLL = 0.00025  # [s] where something new is awaited
 _LOOK = 0.001  # [s] between two looks at what goes on
 _TRIES = 5  # of a motion that a watchdog stops, of readings that disagree
@@ -45,6 +48,15 @@ class BusReading:
     """Current or torque of each motor, for ``Observation.info`` [unit of the bus]."""
     oldest: str = ""
     """Which motor's reading is the oldest, where they come one by one: for errors."""
+
+
+@dataclass
+class _Shown:
+    """Of a motion: who watches it, when the newest reading was taken, and the last that was shown."""
+
+    watch: Callable[[Observation], bool] | None
+    taken: float
+    at: float = -math.inf
 
 
 class HandDriver(ABC):
@@ -193,24 +205,50 @@ class HandDriver(ABC):
         delta = torch.as_tensor(delta_a).detach().cpu().double()
         check_shape("delta_a", delta, (self.hand.n_a,), f"in order: {', '.join(self.hand.actuator_names)}")
         check_finite("delta_a", delta)
-        worst = int(delta.abs().argmax())
-        if float(delta[worst].abs()) > self.limits.increment + _SLACK:
-            motor, most = self.wiring.motors[worst], math.degrees(self.limits.increment)
+        return self._go(Waypoints.through(delta[None], self.limits.rate), None)
+
+    def follow(self, path: Waypoints, watch: Callable[[Observation], bool]) -> Observation:
+        """Move through the waypoints, wait until the motors rest, read; see
+        :class:`~torch_ekm.plant.FollowingPlant`.
+
+        ``watch`` is given a reading each ``limits.period`` at most; what it does may take no longer, and
+        where the servos have a watchdog of their own (80 ms) it stops them.
+
+        Raises:
+            EKMError: see :meth:`command`; ``limits.increment`` holds for each piece. After a failure that
+                is not of the bus the motors are commanded to hold.
+        """
+        check_shape("waypoints", path.waypoints[0], (self.hand.n_a,), "for each waypoint")
+        return self._go(path, watch)
+
+    def _go(self, path: Waypoints, watch: Callable[[Observation], bool] | None) -> Observation:
+        pieces = path.pieces.flatten()
+        worst = int(pieces.abs().argmax())
+        if float(pieces[worst].abs()) > self.limits.increment + _SLACK:
+            motor, most = self.wiring.motors[worst % self.hand.n_a], math.degrees(self.limits.increment)
             raise CommandRefusedError(
                 f"motor '{motor.name}'",
-                f"a command of {math.degrees(float(delta[worst])):.3g} deg, [limits] increment in "
+                f"a command of {math.degrees(float(pieces[worst])):.3g} deg, [limits] increment in "
                 f"{self.wiring.path} is {most:.3g} deg: make smaller motions, or allow more",
             )
         start = self._stands()
-        goal = self._within(start, start + delta.numpy())
+        goals = [self._within(start, start + w) for w in path.waypoints.numpy()]
         if self.dry_run:
-            shown = [
-                f"{one.name} (id {one.id}) to {one.bus(a):.6g} {self.unit} = {math.degrees(a):.4g} deg"
-                for one, a in zip(self.wiring.motors, goal.tolist(), strict=True)
-            ]
-            self._say(f"dry run: {', '.join(shown)}")
-        elif np.any(goal != start):
-            self._move(start, goal)
+            for goal in goals:
+                shown = [
+                    f"{one.name} (id {one.id}) to {one.bus(a):.6g} {self.unit} = {math.degrees(a):.4g} deg"
+                    for one, a in zip(self.wiring.motors, goal.tolist(), strict=True)
+                ]
+                self._say(f"dry run: {', '.join(shown)}")
+        elif np.any(np.array(goals) != start):
+            try:
+                self._move(start, goals, path.durations.tolist(), watch)
+            except BusError:  # nothing more goes out: the hand stands after the piece under way
+                raise
+            except BaseException:
+                with contextlib.suppress(Exception):
+                    self.hold()
+                raise
         else:
             self.hold()
         self._last = self._newer(reading=self._last)
@@ -280,33 +318,64 @@ class HandDriver(ABC):
             time.sleep(_POLL)
             reading = None
 
-    def _move(self, start: Array, goal: Array) -> None:
+    def _move(
+        self,
+        start: Array,
+        goals: list[Array],
+        seconds: list[float],
+        watch: Callable[[Observation], bool] | None,
+    ) -> None:
         """Send a motion piece by piece, and wait for its end."""
+        shown = _Shown(watch, time.monotonic())
         for _ in range(_TRIES):
-            way = float(np.abs(goal - start).max()) / self.limits.rate  # [s]
-            pieces = max(1, math.ceil(way / _REACH - 1e-9))
-            end = -math.inf
             with self._moving():
-                for k in range(1, pieces + 1):
-                    now = time.monotonic()
-                    end = max(end, now) + way / pieces
-                    self._write(self._bus(start + k / pieces * (goal - start)), end - now)
-                    if k < pieces:
-                        self._wait(end - _LEAD)
-                arrived = np.abs(self._rest(end) - goal) <= self.limits.still
-                if arrived.all() or not self._cut_short():
+                end, stopped = self._send_along(start, goals, seconds, shown)
+                arrived = np.abs(self._rest(end) - goals[-1]) <= self.limits.still
+                if stopped or arrived.all() or not self._cut_short():
                     return
-            start = self._stands()
+            here = self._stands()
+            k = _nearest([start, *goals], here)
+            start, goals, seconds = here, goals[k:], seconds[k:]
         remedy = "this process is too slow for it, or goals get lost"
         problem = f"the watchdog has stopped a motion {_TRIES} times: {remedy}"
         raise BusError(self.wiring.path.name, problem)
 
-    def _wait(self, end: float) -> None:
-        """Read until that time: a bus with a watchdog is kept awake."""
+    def _send_along(
+        self, start: Array, goals: list[Array], seconds: list[float], shown: _Shown
+    ) -> tuple[float, bool]:
+        """Positions along the way; when the last is reached, and whether the watcher has ended it."""
+        end = -math.inf
+        for k, (goal, least) in enumerate(zip(goals, seconds, strict=True)):
+            way = max(least, float(np.abs(goal - start).max()) / self.limits.rate)  # [s]
+            pieces = max(1, math.ceil(way / _REACH - 1e-9))
+            for i in range(1, pieces + 1):
+                now = time.monotonic()
+                end = max(end, now) + way / pieces
+                self._write(self._bus(start + i / pieces * (goal - start)), end - now)
+                last = k == len(goals) - 1 and i == pieces
+                if (not last or shown.watch) and not self._wait(end - _LEAD, shown):
+                    part = (i - max(0.0, end - time.monotonic()) / (way / pieces)) / pieces
+                    self._write(self._bus(start + part * (goal - start)), 0.01)  # at once
+                    self.hold()
+                    return time.monotonic(), True
+            start = goal
+        return end, False
+
+    def _wait(self, end: float, shown: _Shown) -> bool:
+        """Read until that time: a bus with a watchdog is kept awake. False: the motion is to end."""
         while (left := end - time.monotonic()) > 0:
             if left > 5 * _LOOK:  # else a slow bus would answer after the end
-                self._read()
+                reading = self._read()
+                if reading.taken > shown.taken:
+                    shown.taken = reading.taken
+                elif time.monotonic() - shown.taken > max(_BLIND, 4 * self.limits.period):
+                    raise self._stale("motors", reading.taken, reading.oldest)
+                if shown.watch and reading.taken >= shown.at + self.limits.period:
+                    shown.at = reading.taken
+                    if not shown.watch(self._observation(reading)):
+                        return False
             time.sleep(min(_LOOK, max(0.0, end - time.monotonic())))
+        return True
 
     def _rest(self, end: float) -> Array:
         """Read until the motors have stood for ``still_for``; they arrive by ``end``. Where they stand."""
@@ -326,8 +395,6 @@ class HandDriver(ABC):
                 self._while_standing()
             left = since + self.limits.still_for - time.monotonic()
             time.sleep(left if 0 < left < 3 * _LOOK else _POLL if math.isinf(left) else _LOOK)
-        with contextlib.suppress(Exception):
-            self.hold()
         names = [m.name for m, way in zip(self.wiring.motors, self._spread(seen), strict=True) if way]
         what = f"motor '{', '.join(names)}'" if names else str(self.wiring.path)
         raise NeverAtRestError(
@@ -376,3 +443,12 @@ class HandDriver(ABC):
 
     def _by_lines(self, readings: Tensor, a: Tensor) -> Tensor:
         return self._posture(self._values(self.wiring.joints, readings.tolist()), a)
+
+
+def _nearest(knots: list[Array], at: Array) -> int:
+    """Which piece between knots passes nearest."""
+    away = []
+    for a, b in itertools.pairwise(knots):
+        part = np.clip((at - a) @ (b - a) / max(float((b - a) @ (b - a)), 1e-12), 0, 1)
+        away.append(float(np.linalg.norm(at - a - part * (b - a))))
+    return int(np.argmin(away))

@@ -75,7 +75,14 @@ class WithPose(PlantWrapper):
         Raises:
             ObjectLostError: it was never seen.
         """
-        sighting, status = self._look(seen.taken.encoders), PlantStatus.HELD
+        return self._with(self._look(seen.taken.encoders), seen)
+
+    def passing(self, seen: Observation) -> Observation:
+        """``seen`` with the newest pose that there is: a hand that moves waits for none."""
+        return self._with(self.source(), seen)
+
+    def _with(self, sighting: Sighting | None, seen: Observation) -> Observation:
+        status = PlantStatus.HELD
         if sighting is None:
             sighting, status = self._last, PlantStatus.NOT_SEEN
         if sighting is None:

@@ -15,7 +15,7 @@ from ..drivers import Channel, Wiring
 from ..exceptions import EKMError, GraspError
 from ..kinematics import ActuationMap, HandKinematics
 from ..model import KinematicModel
-from ..plant import Gate, Observation, Plant, PlantStatus
+from ..plant import Gate, Observation, Path, Plant, PlantStatus, can_follow
 from ..typing import Array
 from .row import Check
 from .wirings import Mistake, Motion, Readings, WiringTest
@@ -113,6 +113,8 @@ class _Checked:
             elif not watched:
                 found += "; without joint sensors signs, order and units are not checked"
             yield Check("wiring", "ok", found)
+            if can_follow(self.plant):
+                yield self._follows()
 
     # -- single readings ----------------------------------------------------------------------------
 
@@ -224,6 +226,22 @@ class _Checked:
         if along and not any(row.state == "error" for row in rows):
             rows += self._frame(along)
         return tuple(motions), rows
+
+    def _follows(self) -> Check:
+        """A movement of 1 deg and back, in 0.2 s; the first motor that may move makes it."""
+        held = self.looks[-1].status is PlantStatus.HELD
+        i = next(k for k, one in enumerate(self.hand.actuators) if not (held and one.posture))
+        way, passed = torch.zeros(2, self.hand.n_a, dtype=torch.float64), []
+        way[0, i] = self._sign(i, float(self._look().a[i])) * _DEG
+        path = Path.through(way, 10 * _DEG)
+        try:
+            self._gate.follow(path, lambda seen: passed.append(seen) or True, by="check")
+        except EKMError as error:
+            return Check("follow", "error", str(error), "correct follow() of the driver, or leave it out")
+        if not passed:
+            found = "no reading on the way: nothing can end a movement"
+            return Check("follow", "warning", found, "give watch the readings as they come")
+        return Check("follow", "ok", f"a movement through 2 waypoints, {len(passed)} readings on the way")
 
     def _motion(self, i: int) -> tuple[Motion | None, Check | None, Array]:
         """A motor goes as little as shows, and back; what speaks against it at once."""

@@ -33,7 +33,7 @@ class IdealServos(Recorded, nn.Module):
     """
 
     learns = False
-    moved_from = largest = 0.0
+    moved_from = resolution = largest = 0.0
 
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__()

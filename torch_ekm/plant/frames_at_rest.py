@@ -43,6 +43,10 @@ class FramesAtRest(PlantWrapper):
         super().__init__(plant)
         self.frames = frames
 
+    def passing(self, seen: Observation) -> Observation:
+        """``seen``: a hand that moves shows no second frame of the same pose."""
+        return seen
+
     def observation(self, seen: Observation) -> Observation:
         """The mean of ``seen`` and of the readings that follow; the loss of an object ends them."""
         readings = [seen]

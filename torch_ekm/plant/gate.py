@@ -10,11 +10,13 @@ from typing import NoReturn
 
 import torch
 
+from .._checks import check_kind
 from ..description import HandDescription
 from ..exceptions import CommandRefusedError, PlantInUseError
 from ..typing import Float, Tensor
 from .observation import Observation
-from .plant import Plant
+from .path import Path
+from .plant import Plant, can_follow
 from .readable import readable
 from .wrapper import PlantWrapper
 
@@ -31,7 +33,8 @@ class Gate(PlantWrapper):
         sum |v|_max over any time t <= increment + speed t
 
     a is an encoder reading that was accepted: one outside the range leaves the way back into it. t is the
-    plant's own clock; an undated one has no rate. ``v = 0``, to hold, passes always.
+    plant's own clock; an undated one has no rate. ``v = 0``, to hold, passes always. Of a movement through
+    waypoints each piece is such a v, and goes at the mean speed that is stated, of at most ``speed``.
 
     Kind, shape, type, finite numbers, status and clock of each reading are looked at, so a plant of eighteen
     lines is as safe as one of ours. A :class:`~torch_ekm.control.ClosedLoop` puts a gate before its plant,
@@ -105,10 +108,77 @@ class Gate(PlantWrapper):
                 is allowed.
             PlantInUseError: another one commands this plant.
         """
-        owner = _OWNERS.get(id(_innermost(self.plant)))
-        with contextlib.nullcontext() if owner is self else self.owned():
+        with self._mine():
             v = self._check(delta_a, start, by)
             return self._read(lambda: self.plant.command(v))
+
+    def follow(  # type: ignore[override]
+        self,
+        path: Path,
+        watch: Callable[[Observation], bool],
+        start: Observation | None = None,
+        by: str = "user",
+    ) -> Observation:
+        """Move the actuators through the waypoints, wait, read the sensors; see
+        :class:`~torch_ekm.plant.FollowingPlant`.
+
+        A plant that cannot follow is given single commands, each through as many waypoints as ``increment``
+        and the direction of its motors allow, and is watched between them.
+
+        Args:
+            watch, start, by: as for :class:`~torch_ekm.plant.FollowingPlant` and :meth:`command`.
+
+        Raises:
+            CommandRefusedError: nothing was sent.
+            PlantInUseError: another one commands this plant.
+            EKMError: a reading on the way is none; the hand holds.
+        """
+        failed: list[Exception] = []
+
+        def look(seen: Observation) -> bool:
+            try:
+                self.last = readable(seen, self._hand)
+                return watch(self.last)
+            except Exception as error:
+                failed.append(error)
+                return False
+
+        with self._mine():
+            begin = self._check_path(path, start, by)
+            plant = self.plant
+            if can_follow(plant):
+                after = self._read(lambda: plant.follow(path, look))
+            else:
+                after = self._read(lambda: self._by_commands(path, look, begin.a))
+            if failed:
+                self.failure = failed[0]
+                raise failed[0]
+            return after
+
+    @contextlib.contextmanager
+    def _mine(self) -> Iterator[None]:
+        owner = _OWNERS.get(id(_innermost(self.plant)))
+        with contextlib.nullcontext() if owner is self else self.owned():
+            yield
+
+    def _by_commands(self, path: Path, look: Callable[[Observation], bool], at: Tensor) -> Observation:
+        """A path in single commands, from encoders ``at`` on."""
+        goals, pieces, k = at + path.waypoints, path.pieces, 0
+        while True:
+            last = k
+            while last + 1 < len(goals) and self._in_one(goals[last + 1] - at, pieces[k : last + 2]):
+                last += 1
+            v = goals[last] - at
+            seen = self.plant.command(v * min(1.0, self.increment / max(float(v.abs().max()), 1e-12)))
+            k = last + 1
+            if k == len(goals) or not look(seen):
+                return seen
+            assert self.last is not None
+            at = self.last.a
+
+    def _in_one(self, v: Tensor, pieces: Tensor) -> bool:
+        turns = (pieces.amin(0) < 0) & (pieces.amax(0) > 0)
+        return float(v.abs().max()) <= self.increment and not bool(turns.any())
 
     def _check(self, delta_a: object, start: Observation | None, by: str) -> Tensor:
         """v in float64, or a refusal."""
@@ -122,24 +192,43 @@ class Gate(PlantWrapper):
             self._refuse("the hand", by, kind, f"{len(names)} numbers [rad]: {', '.join(names)}")
         if not bool(v.any()):  # NaN is not 0
             return v
-        a = (start or self.last or self.observe()).a
-        lower, upper = torch.minimum(self._range[0], a), torch.maximum(self._range[1], a)
-        size, goal, left = v.abs(), a + v, self._budget(start or self.last)
-        most = f"up to {self.increment / _DEG:.3g} deg (Guards.increment)"
+        start = start or self.last or self.observe()
+        left = self._budget(start)
         rate = f"{left / _DEG:.3g} deg now, at {self.speed / _DEG:.4g} deg/s: wait for the end of a motion"
+        self._check_limits(start.a, v[None], v[None], v.new_tensor([[left]]), rate, by)
+        self._left = left - float(v.abs().max())
+        return v
+
+    def _check_path(self, path: Path, start: Observation | None, by: str) -> Observation:
+        """The reading from which it goes, or a refusal."""
+        names, w = self._hand.actuator_names, check_kind("path", path, Path).waypoints
+        if w.shape[1] != len(names):
+            kind = f"waypoints of {w.shape[1]} numbers"
+            self._refuse("the hand", by, kind, f"{len(names)} numbers [rad]: {', '.join(names)}")
+        start = start or self.last or self.observe()
+        left, pieces = self._budget(start), path.pieces
+        rate = f"{self.speed / _DEG:.4g} deg/s, mean of a piece"
+        self._check_limits(start.a, w, pieces, self.speed * path.durations[:, None], rate, by)
+        self._left = left - float(pieces.abs().amax(1).sum())  # a plant that does not wait is slowed down
+        return start
+
+    def _check_limits(self, a: Tensor, w: Tensor, pieces: Tensor, most: Tensor, rate: str, by: str) -> None:
+        """Refuse what is beyond the limits of set-points ``a + w`` and pieces between them, ``(n, n_a)``."""
+        lower, upper = torch.minimum(self._range[0], a), torch.maximum(self._range[1], a)
+        size, goal = pieces.abs(), a + w
+        largest = f"up to {self.increment / _DEG:.3g} deg (Guards.increment)"
         for wrong, what, value, allowed in (
-            (~v.isfinite(), "an increment", v, "finite ones"),
-            (size > self.increment + _ROUNDED, "an increment", v, most),
+            (~pieces.isfinite(), "an increment", pieces, "finite ones"),
+            (size > self.increment + _ROUNDED, "an increment", pieces, largest),
             (torch.maximum(lower - goal, goal - upper) > _ROUNDED, "a set-point", goal, "{} to {} deg"),
-            (size > left + _ROUNDED, "an increment", v, rate),
+            (size > most + _ROUNDED, "an increment", pieces, rate),
         ):
             if bool(wrong.any()):
-                i = int(wrong.int().argmax())
+                k, i = divmod(int(wrong.flatten().int().argmax()), len(a))
                 ends = [f"{float(edge[i]) / _DEG:.4g}" for edge in self._range]
-                asked = f"{what} of {float(value[i]) / _DEG:.4g} deg"
-                self._refuse(f"actuator '{names[i]}'", by, asked, allowed.format(*ends))
-        self._left = left - float(size.max())
-        return v
+                asked = f"{what} of {float(value[k, i]) / _DEG:.4g} deg"
+                name = self._hand.actuator_names[i]
+                self._refuse(f"actuator '{name}'", by, asked, allowed.format(*ends))
 
     def _budget(self, start: Observation | None) -> float:
         """How far a command may go by the rate [rad]; a clock that goes back was set anew."""

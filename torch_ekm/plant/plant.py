@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Protocol, TypeGuard, runtime_checkable
 
 from ..typing import Float, Tensor
 from .observation import Observation
+from .path import Path
 
 
 @runtime_checkable
@@ -26,3 +28,24 @@ class Plant(Protocol):
 
     def close(self) -> None:
         """Release devices, windows and files; the plant is not used afterwards."""
+
+
+class FollowingPlant(Plant, Protocol):
+    """A plant whose motors go through waypoints, and that can be watched on the way.
+
+    ``command(delta_a)`` is the movement with one waypoint.
+    """
+
+    def follow(self, path: Path, watch: Callable[[Observation], bool]) -> Observation:
+        """Move through the waypoints, wait until the hand rests, read the sensors.
+
+        Args:
+            watch: is given the readings that come on the way, in order, at the plant's own rate; where it
+                answers False, or raises, the motors are commanded to stay where they are.
+        """
+        ...
+
+
+def can_follow(plant: Plant) -> TypeGuard[FollowingPlant]:
+    """Whether a plant has :meth:`FollowingPlant.follow`; a wrapper has it where what it wraps has."""
+    return hasattr(plant, "follow")

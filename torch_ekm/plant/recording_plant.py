@@ -1,13 +1,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import torch
 
 from ..typing import Float, Tensor
 from .observation import Observation
-from .plant import Plant
-from .trajectory import Trajectory
+from .path import Path
+from .plant import Plant, can_follow
+from .trajectory import Movement, Trajectory
 from .wrapper import PlantWrapper
 
 
@@ -49,7 +51,19 @@ class RecordingPlant(PlantWrapper):
         """Pass the increment [rad] on; it and the observation after it are recorded."""
         if not self.trajectory.observations:
             self.observe()
-        observation = self.plant.command(delta_a)
+        return self._kept(delta_a, self.plant.command(delta_a))
+
+    def _followed(self, path: Path, watch: Callable[[Observation], bool]) -> Observation:
+        """Pass the path on; it, the readings on the way and the observation after it are recorded."""
+        if not self.trajectory.observations:
+            self.observe()
+        assert can_follow(self.plant)
+        passed: list[Observation] = []
+        observation = self.plant.follow(path, lambda seen: passed.append(seen) or watch(seen))
+        self.trajectory.movements[len(self.trajectory.commands)] = Movement(path, passed)
+        return self._kept(path.waypoints[-1], observation)
+
+    def _kept(self, delta_a: Float[Tensor, " n_a"], observation: Observation) -> Observation:
         self.trajectory.commands.append(torch.as_tensor(delta_a).detach().cpu().double().clone())
         self.trajectory.observations.append(observation)
         return observation

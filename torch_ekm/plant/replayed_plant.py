@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from ..exceptions import StateError
 from ..typing import Float, Tensor
 from .observation import Observation
+from .path import Path
 from .trajectory import Trajectory
 
 
@@ -40,6 +43,19 @@ class ReplayedPlant:
             raise StateError(f"the recording ends after {self._place} commands; reset() begins again")
         self._place += 1
         return self.observe()
+
+    def follow(self, path: Path, watch: Callable[[Observation], bool]) -> Observation:
+        """The next observation, after the recorded readings on the way, if it was a movement.
+
+        Raises:
+            StateError: the trajectory ends here.
+        """
+        movement = self.trajectory.movements.get(self._place)
+        after = self.command(path.waypoints[-1])
+        for seen in movement.passed if movement else ():
+            if not watch(seen):
+                break
+        return after
 
     def close(self) -> None:
         """Does nothing: a recording holds no device."""

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from .._checks import check_finite, check_shape
@@ -10,6 +12,7 @@ from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .gate import Gate
 from .observation import Observation
+from .path import Path
 from .plant import Plant
 from .wrapper import PlantWrapper
 
@@ -25,8 +28,9 @@ class ServoInverse(PlantWrapper):
         print(plant.servo)          # dead zones and biases with standard errors
 
     ``|v - w| <= servo.largest``, and v goes beyond the gate's increment only where w does: no estimate makes
-    a command large. A loop that judges readings itself uses :meth:`send` and :meth:`learn`, so that nothing
-    is learned from one that it refuses.
+    a command large. Along a path each motor is compensated in the direction in which it goes, and a piece
+    that becomes longer takes longer. A loop that judges readings itself uses :meth:`send`,
+    :meth:`send_path` and :meth:`learn`, so that nothing is learned from one that it refuses.
 
     Args:
         plant: with encoders (``Observation.a``); one that is no :class:`Gate` gets one.
@@ -44,7 +48,8 @@ class ServoInverse(PlantWrapper):
         self.servo = ServoModel(hand.actuator_names) if servo is None else servo
         self._range = [torch.from_numpy(edge) for edge in (hand.actuator_lower, hand.actuator_upper)]
         self._start = self.sent = torch.zeros(len(self.servo.names), dtype=torch.float64)
-        """v of the last motion [rad]."""
+        """v of the last motion [rad]; of a path, its last waypoint."""
+        self._told = torch.ones(len(self.servo.names), dtype=torch.bool)  # motors that it tells something of
 
     @property
     def stuck(self) -> tuple[str, ...]:
@@ -69,16 +74,59 @@ class ServoInverse(PlantWrapper):
         (delta_a,), names = as_tensors(delta_a=delta_a), self.servo.names
         check_shape("delta_a", delta_a, (len(names),), f"in order: {', '.join(names)}")
         check_finite("delta_a", delta_a)
-        added = (self.servo.command(delta_a) - delta_a).clamp(-self.servo.largest, self.servo.largest)
-        most = delta_a.abs().clamp(min=self.gate.increment)
-        v = self._within_range(start.a, (delta_a + added).clamp(-most, most))
-        self._start, self.sent = start.a, v
-        return self.gate.command(v, start, by)
+        v, _ = self._inverse(delta_a[None], start)
+        self._start, self.sent, self._told = start.a, v[0], torch.ones_like(self._told)
+        return self.gate.command(v[0], start, by)
+
+    def follow(  # type: ignore[override]
+        self, path: Path, watch: Callable[[Observation], bool]
+    ) -> Observation:
+        """Move the encoders through the waypoints, wait, read the sensors, learn of the servos.
+
+        Raises:
+            EKMError: see :meth:`Gate.follow`.
+        """
+        after = self.send_path(path, watch, self.gate.last or self.observe(), "user")
+        self.learn(after)
+        return after
+
+    def send_path(
+        self, path: Path, watch: Callable[[Observation], bool], start: Observation, by: str
+    ) -> Observation:
+        """The same from an accepted reading, and nothing is learned.
+
+        Of a motor that turns round on the way, and of a path that ``watch`` ends, :meth:`learn` learns
+        nothing: what a dead zone took of them is not seen at the end.
+        """
+        check_shape("waypoints", path.waypoints[0], (len(self.servo.names),), "for each waypoint")
+        v, last = self._inverse(path.waypoints, start)
+        seconds = v.diff(dim=0, prepend=torch.zeros_like(v[:1])).abs().amax(1) / self.gate.speed
+        sent = Path(v, torch.maximum(path.durations, seconds).cumsum(0))
+        onward = last * path.waypoints[-1] > self.servo.resolution  # else it ends on its way back
+        self._start, self.sent, self._told = start.a, v[-1], onward | (last == 0)
+
+        def look(seen: Observation) -> bool:
+            goes_on = watch(seen)
+            self._told = self._told & goes_on
+            return goes_on
+
+        return self.gate.follow(sent, look, start, by)
+
+    def _inverse(self, waypoints: Tensor, start: Observation) -> tuple[Tensor, Tensor]:
+        """Set-points for the waypoints ``(n, n_a)``, and the sign of each motor's last motion, 0: none."""
+        sent, sign, moved = [torch.zeros_like(waypoints[0])], torch.zeros_like(waypoints[0]), waypoints[0] * 0
+        for w, piece in zip(waypoints, waypoints.diff(dim=0, prepend=waypoints[:1] * 0), strict=True):
+            moves = (w - moved).abs() > self.servo.resolution
+            sign, moved = torch.where(moves, (w - moved).sign(), sign), torch.where(moves, w, moved)
+            added = (self.servo.command(sign) - sign).clamp(-self.servo.largest, self.servo.largest)
+            most = piece.abs().clamp(min=self.gate.increment)
+            sent.append(sent[-1] + (torch.where(sign != 0, w + added, 0.0) - sent[-1]).clamp(-most, most))
+        return torch.stack([self._within_range(start.a, v) for v in sent[1:]]), sign
 
     def learn(self, after: Observation) -> None:
         """An accepted reading after the last motion."""
         start, v = self._start, self.sent
-        self.servo.update(v, after.a - start, self._free(start, v, after.a))
+        self.servo.update(v, after.a - start, self._told & self._free(start, v, after.a))
 
     def _within_range(self, a: Tensor, v: Tensor) -> Tensor:
         """v, cut where ``a + v`` would lie outside; it is never turned round."""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,16 +15,27 @@ from .._files import told_as_damage
 from ..exceptions import ParameterError, StateError
 from ..typing import Tensor
 from .observation import Observation, PlantStatus, Stamps, Truth
+from .path import Path as Waypoints
 from .trial_file import read_trial, write_trial
 
 _FIELDS = ("q", "a", "position", "rotation")
 _FORCE = "fingertip_force"  # missing where nothing measures it
+_PATHS, _PASSED = "paths", "passed"  # groups: of followed movements what was sent, and readings on the way
 _GROUPS = ("raw", "estimate")  # what is kept of Observation.info, and "events"
+
+
+class Movement(NamedTuple):
+    """A path that was followed, and the readings on the way."""
+
+    path: Waypoints
+    passed: list[Observation]
 
 
 @dataclass
 class Trajectory:
     """Commands and observations of one grasp: ``n`` commands, ``n + 1`` observations.
+
+    A path that was followed counts as the command of its last waypoint.
 
     It also keeps of ``Observation.info`` the named arrays in "raw" (Hall counts, marker corners, images) and
     "estimate" (what else was estimated, such as covariances), and what is in "events", as text.
@@ -36,12 +47,16 @@ class Trajectory:
     about: dict[str, Any] = field(default_factory=dict)
     """Anything else that JSON can hold: configuration, versions, outcome. No times of day: equal runs
     are to give equal files."""
+    movements: dict[int, Movement] = field(default_factory=dict)
+    """Commands that were paths, by their number."""
 
     def save(self, path: str | Path) -> Path:
         """Write an HDF5 file, whole or not at all; equal recordings give equal files, byte by byte.
 
         ``commands (n, n_a)`` [rad], each sensor ``(n + 1, ...)`` [SI], groups ``truth``, ``raw`` and
         ``estimate``; a SHA-256 of all its bytes. Without fingertip sensors there is no ``fingertip_force``.
+        Of m followed waypoints ``paths/waypoints (m, n_a)``, ``paths/times (m,)`` and ``paths/command (m,)``,
+        the number of the command; in the group ``passed`` the same for the readings on the way.
 
         Raises:
             ParameterError: ``about`` is nothing that JSON can hold, or the forces or an array of ``info``
@@ -50,7 +65,7 @@ class Trajectory:
             OutputError: the file cannot be written.
         """
         path = Path(path)
-        write_trial(path, self.seed, plain(self.about), self.arrays())
+        write_trial(path, self.seed, plain(self.about), self.arrays() | self._of_movements())
         return path
 
     @classmethod
@@ -67,11 +82,14 @@ class Trajectory:
 
     @classmethod
     def from_arrays(cls, seed: int, about: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Trajectory:
-        """What :meth:`arrays` gave, as a trajectory again.
+        """What is in a file, or what :meth:`arrays` gave, as a trajectory again.
 
         Raises:
             KeyError: an array is missing.
         """
+        movements = _movements(arrays)
+        own = (_PATHS, _PASSED)
+        arrays = {place: v for place, v in arrays.items() if place.partition("/")[0] not in own}
         names = (*_FIELDS, "commands", *((_FORCE,) if _FORCE in arrays else ()))
         sensors = {name: torch.from_numpy(arrays[name]) for name in names}
         stamps = arrays.get("stamps")
@@ -91,10 +109,10 @@ class Trajectory:
             taken = None if stamps is None else Stamps(*stamps[k].tolist())
             other = {"status": PlantStatus(words[k].decode()), "info": info, "truth": known, "stamps": taken}
             observations.append(Observation(**_row(sensors, k), time=time, **other))
-        return cls(seed, commands, observations, about)
+        return cls(seed, commands, observations, about, movements)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything but seed and ``about``, by its place in the file; see :meth:`from_arrays`.
+        """Commands, and a row for each observation, by their places in the file; see :meth:`from_arrays`.
 
         Raises:
             ParameterError: the forces or an array of ``info`` change their shape.
@@ -125,6 +143,42 @@ class Trajectory:
                     )
                 arrays[place] = _stack(place, [values[name] for values in named])
         return arrays
+
+    def _of_movements(self) -> dict[str, np.ndarray]:
+        """What :func:`_movements` reads."""
+        if not self.movements:
+            return {}
+        moved = sorted(self.movements.items())
+        paths = [one.path for _, one in moved]
+        arrays = {
+            f"{_PATHS}/command": np.repeat([k for k, _ in moved], [len(path.times) for path in paths]),
+            f"{_PATHS}/waypoints": torch.cat([path.waypoints for path in paths]).numpy(),
+            f"{_PATHS}/times": torch.cat([path.times for path in paths]).numpy(),
+        }
+        passed = Trajectory(observations=[seen for _, one in moved for seen in one.passed])
+        if passed.observations:
+            of = [k for k, one in moved for _ in one.passed]
+            there = {**passed.arrays(), "command": np.array(of)}
+            arrays |= {f"{_PASSED}/{place}": v for place, v in there.items() if place != "commands"}
+        return arrays
+
+
+def _movements(arrays: Mapping[str, np.ndarray]) -> dict[int, Movement]:
+    """The followed movements, by the numbers of their commands; a file of before has none."""
+    if f"{_PATHS}/command" not in arrays:
+        return {}
+    of, w, t = (arrays[f"{_PATHS}/{name}"] for name in ("command", "waypoints", "times"))
+    found = {
+        int(k): Movement(Waypoints(torch.from_numpy(w[of == k]), torch.from_numpy(t[of == k])), [])
+        for k in np.unique(of)
+    }
+    there = {p.partition("/")[2]: value for p, value in arrays.items() if p.startswith(f"{_PASSED}/")}
+    if there:
+        numbers = there.pop("command").tolist()
+        passed = Trajectory.from_arrays(0, {}, {**there, "commands": np.zeros(0)}).observations
+        for k, seen in zip(numbers, passed, strict=True):
+            found[k].passed.append(seen)
+    return found
 
 
 def _row(arrays: Mapping[str, Tensor], k: int) -> dict[str, Any]:

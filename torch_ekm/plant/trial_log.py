@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import os
 import re
@@ -161,7 +162,7 @@ class TrialLog:
             "trial": trial,
             "versions": versions_of(_PACKAGES),
         }
-        kept = Trajectory(trajectory.seed, trajectory.commands, trajectory.observations, plain(about))
+        kept = dataclasses.replace(trajectory, about=plain(about))
         path = kept.save(self.path(trial))
         self._index[trial] = _entry(trial, *read_trial(path, _TOLD.__contains__))
         self._write_index()

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ..exceptions import ParameterError
-from ..plant import Observation, PlantWrapper
+from ..plant import Observation, Path, PlantWrapper
 from ..typing import Float, Tensor
 from .simulated_hand import SimulatedHand
 
@@ -73,11 +73,20 @@ class DisturbedPlant(PlantWrapper):
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Let happen what is due, then move the actuators by ``delta_a`` [rad] and read the sensors."""
-        due = [event for event in self.events if event.at == self.count]
+        return self._told(self._happen(), self.plant.command(delta_a))
+
+    def _followed(self, path: Path, watch: Callable[[Observation], bool]) -> Observation:
+        """The same before a movement, which counts as one command."""
+        return self._told(self._happen(), self.plant.follow(path, watch))
+
+    def _happen(self) -> tuple[PlantChange | Tug, ...]:
+        due = tuple(event for event in self.events if event.at == self.count)
         for event in due:
             event.happen(self.plant)
         self.count += 1
-        observation = self.plant.command(delta_a)
+        return due
+
+    def _told(self, due: tuple[PlantChange | Tug, ...], observation: Observation) -> Observation:
         if due:
-            observation.info["events"] = tuple(due)
+            observation.info["events"] = due
         return observation

@@ -101,6 +101,8 @@ class PlantParameters:
     """Full width of the play between force and reading [N]."""
     force_range: float = 0.0
     """Full scale of an 8-bit converter [N]; 0: not quantised."""
+    frame_rate: float = 20.0
+    """Of the camera [1/s]."""
     latency: float = 0.0
     """Age of the camera's picture [s]."""
     frame_loss: float = 0.0
@@ -140,7 +142,7 @@ class PlantParameters:
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
-_POSITIVE = {"moment_arm", "spring", "servo_stiffness", "friction", "mass", "object_scale"}
+_POSITIVE = {"moment_arm", "spring", "servo_stiffness", "friction", "mass", "object_scale", "frame_rate"}
 _SIGNED = {"com_shift", "spring_stiffening", "arm_variation"}
 _BELOW = {
     "arm_variation": ("between -0.9 and 0.9", 0.9),

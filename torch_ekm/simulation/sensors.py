@@ -8,13 +8,15 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..kinematics.se3 import exp
+from ..kinematics.se3 import exp, log
 from ..typing import Array
 from .parameters import PlantParameters
 
+_LEAST_ANGLE, _LEAST_LENGTH = np.radians(0.002), 2e-6  # [rad, m] taken for a sensor without noise
+
 
 class TimedState(NamedTuple):
-    """The true state at one moment, hand frame, SI units."""
+    """The state at one moment, true or as it is seen, hand frame, SI units."""
 
     time: float
     """[s]"""
@@ -70,6 +72,22 @@ class Sensors:
     def pictured(self, now: TimedState) -> TimedState:
         """What the camera's picture shows that is to be had now."""
         return self._frames[0] if self._p.latency > 0 and self._frames else now
+
+    def frame(self, now: TimedState, generator: np.random.Generator) -> TimedState:
+        """Joints and pose as the sensors have them, of the time of the picture; an old one if it is lost."""
+        q = self.joints(now.q, generator)
+        position, rotation, taken, _ = self.pose(self.pictured(now), generator)
+        return TimedState(taken, q, position, rotation)
+
+    def agree(self, one: TimedState, other: TimedState) -> bool:
+        """Whether two frames differ by their noise: joints, and pose, each by the mean square of what they
+        differ, in standard deviations, up to one of its own above its mean."""
+        turned = log(torch.from_numpy(other.rotation @ one.rotation.T)).numpy()
+        p = self._p
+        angle, length = max(p.rotation_noise, _LEAST_ANGLE), max(p.position_noise, _LEAST_LENGTH)
+        pose = np.concatenate([turned / angle, (other.position - one.position) / length])
+        joints = (other.q - one.q) / max(p.joint_noise, _LEAST_ANGLE)
+        return all(np.mean(z**2) / 2 <= 1 + np.sqrt(2 / len(z)) for z in (pose, joints))
 
     def joints(self, q: Array, generator: np.random.Generator) -> Array:
         """Joint angles ``(n_q,)`` [rad] with noise; those of stuck channels do not change."""

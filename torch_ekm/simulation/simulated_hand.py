@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from ..description import HandDescription, ObjectDescription, load_hand, load_ob
 from ..exceptions import EquilibriumError, GraspError, ParameterError, StateError, UnknownNameError
 from ..kinematics import GraspState
 from ..plant import Observation, PlantStatus, Stamps, Truth
+from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
 from .grasp_planning.pinch import PinchPlan, exists, pinch_hint, pinch_problem
@@ -22,16 +24,17 @@ from .grasp_planning.pinch_problem import PinchRequest
 from .grasp_planning.remembered import remembered_pinch
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
-from .physics.rig import COMMAND_TIME, Rig, RigState, changes_transmission
+from .physics.rig import Rig, RigState, changes_transmission
 from .physics.scene import ENGINES
 from .presets import preset as parameters_of
-from .sensors import Sensors, TimedState
+from .sensors import Sensors
 
 _NOT_NATIVE = (
     "joint_friction", "arm_variation", "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling",
     "joint_play",
 )  # fmt: skip
 _ATTEMPTS = 5
+_LONGEST_REST = 0.8  # [s] that rest is waited for after a motion
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
 _OFFSET_ALONG, _OFFSET_ACROSS = 0.010, 0.002  # [m]: grasp points are drawn within +- these, object's axes
 _TILT = 5 * np.pi / 180  # [rad]: the object's long axis is drawn within +- this of the wanted direction
@@ -149,15 +152,29 @@ class SimulatedHand:
         )
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
-        """Move the actuators by ``delta_a`` [rad], let the hand settle, read the sensors.
+        """Move the actuators by ``delta_a`` [rad], let the hand come to rest, read the sensors.
+
+        It rests where two frames of camera and joint sensors, both newer than the motion, agree within their
+        noise; 0.8 s are waited at most.
 
         Raises:
             ShapeError, NonFiniteError: ``delta_a`` is not ``n_a`` finite numbers; nothing moves.
         """
         rig = self._grasped()
         delta = torch.as_tensor(delta_a).detach().cpu().double().numpy()
-        rig.move(rig.servo.plan(delta, self._generator))
-        return self.observe()
+        rig.follow(rig.servo.plan(delta, self._generator)[None], np.zeros(1))
+        return self._at_rest()
+
+    def follow(self, path: Waypoints, watch: Callable[[Observation], bool]) -> Observation:
+        """Move through the waypoints; ``watch`` has the readings of each frame of the camera on the way.
+
+        Raises:
+            ShapeError: the waypoints are not of ``n_a`` numbers; nothing moves.
+        """
+        rig = self._grasped()
+        goals = rig.servo.plan(path.waypoints.numpy(), self._generator)
+        rig.follow(goals, path.times.numpy(), lambda: watch(self.observe()))
+        return self._at_rest()
 
     def observe(self) -> Observation:
         """Read the sensors; their noise is drawn again."""
@@ -165,7 +182,7 @@ class SimulatedHand:
         q, (position, rotation) = rig.scene.q, rig.scene.object_pose
         status = self.status
         joints = self._sensors.joints(q, draw)
-        picture = self._sensors.pictured(TimedState(rig.time, q, position, rotation))
+        picture = self._sensors.pictured(rig.state)
         seen_position, seen_rotation, taken, seen = self._sensors.pose(picture, draw)
         force = self._sensors.forces(rig.normal, rig.time, draw)
         if not seen and status is PlantStatus.HELD:
@@ -269,8 +286,7 @@ class SimulatedHand:
         """Pull at the object [N, at its centre of mass] and twist it [N m], hand frame, then settle."""
         rig = self._grasped()
         rig.wait(duration, (np.asarray(force, dtype=np.float64), np.asarray(torque, dtype=np.float64)))
-        rig.settle(COMMAND_TIME)
-        return self.observe()
+        return self._at_rest()
 
     # -- inside -------------------------------------------------------------------------------------
 
@@ -278,6 +294,19 @@ class SimulatedHand:
         if self._rig is None or self._plan is None:
             raise GraspError("there is no grasp yet: call reset(seed) first")
         return self._rig
+
+    def _at_rest(self) -> Observation:
+        """The reading once two frames agree that are newer than now."""
+        rig, before = self._grasped(), None
+        moved = rig.time
+        while rig.time < moved + _LONGEST_REST:
+            rig.wait(rig.to_frame * self.config.time_step)
+            frame = self._sensors.frame(rig.state, self._generator)
+            if frame.time > (moved if before is None else before.time) + 1e-9:
+                if before is not None and self._sensors.agree(before, frame):
+                    break
+                before = frame
+        return self.observe()
 
     def _checked(self, tendon: str) -> bool:
         """Whether the engine runs the tendons."""

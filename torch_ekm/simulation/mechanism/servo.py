@@ -58,23 +58,34 @@ class Servo:
         self.setpoint = self.encoder
 
     def plan(self, delta: Array, generator: np.random.Generator) -> Array:
-        """Where the motors will stop if commanded to move by ``delta`` ``(n_a,)`` [rad].
+        """Where the motors will stop if commanded to move by ``delta`` [rad].
+
+        Args:
+            delta: ``(n_a,)``, or ``(n, n_a)``: set-points one after the other, all relative to where the
+                motors are, with one fresh error.
 
         Raises:
-            ShapeError, NonFiniteError: ``delta`` is not ``n_a`` finite numbers; nothing is changed.
+            ShapeError, NonFiniteError: it is not n_a finite numbers; nothing is changed.
         """
         delta = np.asarray(delta, dtype=np.float64)
-        if delta.shape != self.lower.shape:
+        if delta.shape[-1:] != self.lower.shape or delta.ndim > 2:
             raise ShapeError("delta_a", f"({len(self.lower)},)", delta.shape)
         if not np.all(np.isfinite(delta)):
             raise NonFiniteError("delta_a", np.flatnonzero(~np.isfinite(delta))[:3].tolist())
         origin = self.encoder if self.relative_to == "encoder" else self.setpoint
-        fresh = self._p.actuator_error * generator.uniform(-1.0, 1.0, size=delta.shape)
-        setpoint = np.clip(origin + delta, self.lower, self.upper)
-        error = setpoint + self.bias + fresh - self.encoder
-        move = error - np.sign(error) * np.minimum(np.abs(error), self._p.dead_zone)
-        self.setpoint = setpoint
-        return np.clip(self.encoder + move, self.lower, self.upper)
+        fresh = self._p.actuator_error * generator.uniform(-1.0, 1.0, size=self.lower.shape)
+        at, stops = self.encoder, []
+        for one in np.atleast_2d(delta):
+            self.setpoint = np.clip(origin + one, self.lower, self.upper)
+            error = self.setpoint + self.bias + fresh - at
+            move = error - np.sign(error) * np.minimum(np.abs(error), self._p.dead_zone)
+            at = np.clip(at + move, self.lower, self.upper)
+            stops.append(at)
+        return np.reshape(stops, delta.shape)
+
+    def stay(self) -> None:
+        """Stop where the motors are."""
+        self.setpoint = self.encoder
 
     def move_to(self, motor: Array) -> Array:
         """Turn the motors to ``motor``; returns where the tendons are then fixed (after the play)."""

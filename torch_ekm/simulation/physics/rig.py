@@ -20,10 +20,10 @@ from ..sensors import TimedState
 from .scene import make_scene
 
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
+_OFTEN = 0.01  # [s] between two states that a late camera may show
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
-_RAMP_TIME = 0.2  # in which a command is carried out [s]
-_RATE_LIMIT = 100 * np.pi / 180  # fastest motion of a motor [rad/s]; a large command takes longer
-COMMAND_TIME = 0.5  # least time of one command, ramp and settling [s]
+_RATE_LIMIT = 100 * np.pi / 180  # fastest motion of a motor [rad/s]
+_SPIN_UP = 0.02  # [s] until it runs so fast: the mechanical time constant of small geared motors
 _FURTHER = 0.5  # longest further wait for a still object [s]
 _CLOSING, _HOLDING, _SETTLING = 0.2, 0.3, 1.0  # [s] of a grasp, object held fixed in the first two
 
@@ -47,7 +47,7 @@ class Rig:
         hand, obj: the bodies.
         config: time steps and rates.
         parameters: what they really are.
-        remember: called every 10 steps if the camera is late.
+        remember: called every 0.01 s if the camera is late.
         engine: which physics, one of :data:`ENGINES`.
         native: the engine runs the tendons, which change no more.
     """
@@ -114,17 +114,41 @@ class Rig:
         scene.hold_object(False)
         self.settle(_SETTLING)
 
-    def move(self, goal: Array) -> None:
-        """Ramp the motors to ``goal`` ``(n_a,)`` [rad] and let the hand settle."""
-        c, start = self.config, self.servo.encoder
-        ramp = max(_RAMP_TIME, float(np.abs(goal - start).max()) / _RATE_LIMIT)
-        self.run(max(1, round(ramp / c.time_step)), lambda part: start + part * (goal - start))
-        self.settle(COMMAND_TIME - _RAMP_TIME)
+    def follow(self, goals: Array, times: Array, frame: Callable[[], bool] | None = None) -> None:
+        """Motors straight from goal to goal ``(n, n_a)`` [rad], at ``times (n,)`` [s] from now, or as fast as
+        they can; ``frame`` at each frame of the camera. Where it answers False they stay where they are."""
+        way = np.abs(np.diff(goals, axis=0, prepend=self.servo.encoder[None])).max(axis=1)
+        fastest = way / _RATE_LIMIT
+        fastest[0] += _SPIN_UP
+        seconds = np.maximum(np.diff(times, prepend=0.0), fastest)
+        for goal, steps in zip(goals, np.maximum(1, np.round(seconds / self.config.time_step)), strict=True):
+            start, left = self.servo.encoder, int(steps)
+            while left:
+                n, done = min(left, self.to_frame) if frame else left, 1 - left / steps
+                self.run(n, lambda part: start + (done + part * n / steps) * (goal - start))  # noqa: B023
+                left -= n
+                if frame and self.to_frame == self._period and not frame():
+                    self.servo.stay()
+                    return
+
+    @property
+    def _period(self) -> int:
+        """Steps between two frames of the camera."""
+        return max(1, round(1 / (self.parameters.frame_rate * self.config.time_step)))
+
+    @property
+    def to_frame(self) -> int:
+        """Steps to the camera's next frame, at least 1: it runs by the clock, whatever the hand does."""
+        return self._period - round(self.time / self.config.time_step) % self._period
+
+    @property
+    def state(self) -> TimedState:
+        """As it truly is now."""
+        return TimedState(self.time, self.scene.q, *self.scene.object_pose)
 
     def settle(self, least: float) -> None:
-        """Wait that long [s], then until the object is still, 0.5 s more at most."""
-        c = self.config
-        self.wait(max(least, c.time_step))
+        """Wait that long [s] after a grasp, then until the object is still, 0.5 s more at most."""
+        self.wait(least)
         for _ in range(round(_FURTHER / 0.05)):
             linear, angular = self.scene.object_speed
             if max(10 * linear, angular) < _STILL:
@@ -144,6 +168,7 @@ class Rig:
         normal = np.zeros(len(self.hand.pads))
         fingers: set[int] = set()
         window = min(_FORCE_WINDOW, steps)
+        begun, often = round(self.time / self.config.time_step), max(1, round(_OFTEN / self.config.time_step))
         for k in range(1, steps + 1):
             output = servo.move_to(motor_at(k / steps))
             if push is not None:
@@ -153,9 +178,8 @@ class Rig:
             else:
                 q = scene.next_q if transmission.stiff else scene.q
                 scene.step(transmission.drive_targets(q, output))
-            if self.parameters.latency > 0 and k % _FORCE_WINDOW == 0:
-                time = self.time + k * self.config.time_step
-                self.remember(TimedState(time, scene.q, *scene.object_pose))
+            if self.parameters.latency > 0 and (begun + k) % often == 0:
+                self.remember(self.state._replace(time=self.time + k * self.config.time_step))
             if k > steps - window:
                 touches = scene.touches()
                 fingers |= {self._finger_of[link] for link in touches if link in self._finger_of}
