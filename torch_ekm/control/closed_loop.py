@@ -14,7 +14,7 @@ from .._checks import check_kind
 from .._extras import require
 from ..enhanced.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import StateError
-from ..plant import Gate, Observation, Plant, PlantStatus, ServoInverse
+from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
 from ..plant.frames_at_rest import mean_reading
 from ..residual.sparse_gp.engine.loading import load_loops
 from .controller import LookAndMoveController
@@ -29,6 +29,7 @@ from .model_error import NOISE
 from .plan import OneStep, Plan, Planner, WholeTurn
 from .reach import Reach, Reachability, out_of_reach, reach, reachability
 from .safety import Safety
+from .safety.on_the_way import OnTheWay
 from .safety.safety import Objection
 from .safety.watch import Watch
 
@@ -268,7 +269,7 @@ class ClosedLoop:
         self, seen: Observation, decision: Decision, ends: Ends, watch: Watch, seconds: float
     ) -> tuple[Step, Objection | None]:
         """Command, observe, learn; why the manipulation must end here, if it must."""
-        first = self._command(seen, decision)
+        first, stopped = self._command(seen, decision)
         began = time.perf_counter()
         expect = lambda moved: self.controller.expect(decision.pieces, self._figures.pulled(moved))
         verdict = watch.motion(seen, decision, self.plant.sent, first, expect, self.plant.observe)
@@ -293,26 +294,18 @@ class ClosedLoop:
                 off = torch.linalg.vector_norm((increment - expected.increment)[-3:])
                 ends.leapt(float(off), verdict.note)
             halt = halt or watch.way(ends.errors, decision, moved)
-        return Step(seen, decision, after, increment, pull, report, seconds, verdict.note), halt
+        note = "; ".join(filter(None, (stopped, verdict.note)))
+        return Step(seen, decision, after, increment, pull, report, seconds, note), halt
 
-    def _command(self, seen: Observation, decision: Decision) -> Observation:
-        """Move the motors through the pieces; the reading at rest."""
-        by, way = "turn" if decision.turns else "grip", torch.zeros_like(decision.delta_a)
-        most, after, sent = self.safety.guards.increment, seen, torch.zeros_like(way)
-        goals = []
-        for one in decision.pieces:
-            way = way + one.action
-            goals.append(self._figures.motors(way))
-        last = torch.zeros_like(way)
-        for k, goal in enumerate(goals):
-            end = k == len(goals) - 1
-            if not end and float((goals[k + 1] - last).abs().max()) <= most:
-                continue
-            step = goal - last
-            after = self.plant.send(step.clamp(-most, most), after, by)
-            sent, last = sent + self.plant.sent, goal
-        self.plant.sent, self.plant._start = sent, seen.a
-        return after
+    def _command(self, seen: Observation, decision: Decision) -> tuple[Observation, str]:
+        """Move the motors through the pieces; the reading at rest, and what stopped them on the way."""
+        ways = torch.stack([one.action for one in decision.pieces]).cumsum(0)
+        path = Path.through(
+            torch.stack([self._figures.motors(way) for way in ways]), self.safety.guards.speed
+        )
+        watch = OnTheWay(self.safety.guards, self.controller.focus, seen, decision)
+        after = self.plant.send_path(path, watch, seen, "turn" if decision.turns else "grip")
+        return after, watch.why
 
     def _learn(
         self, seen: Observation, decision: Decision, after: Observation, moved, verdict, goes_on: bool

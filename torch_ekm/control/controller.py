@@ -37,6 +37,7 @@ DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointL
 
 _LIST = "a list of objects with a method rows(model, seen)"
 
+_STOPPED = 0.9  # of a movement: what falls shorter was stopped, and servos do not explain it
 # of the SQP for a model that is not linear in the action
 _ITERATIONS = 6
 _DAMPING = 0.6  # share of each change that is made
@@ -118,6 +119,7 @@ class LookAndMoveController:
 
         What they did otherwise is spread over the pieces as their ways are.
         """
+        pieces = _made(pieces, moved)
         way = torch.stack([one.action.norm() for one in pieces])
         share = way / way.sum() if bool(way.any()) else way + 1 / len(pieces)
         extra = moved - sum(one.action for one in pieces)
@@ -313,7 +315,7 @@ class LookAndMoveController:
         force, needed = torch.from_numpy(f_n), torch.from_numpy(self._least(f_n, seen))
         return Grip(force, needed, seen.grip or 0.0)
 
-    def none(self, status: StopReason, failure: EKMError, desired: Tensor) -> Decision:
+    def none(self, status: StopReason, failure: EKMError | str, desired: Tensor) -> Decision:
         """No motion, and why."""
         hand = self.kinematic.hand
         zero, still = desired.new_zeros(hand.n_a), desired.new_zeros(hand.n_q + 6)
@@ -347,3 +349,14 @@ class LookAndMoveController:
         lower, upper = problem.bounds
         at_end = (after <= hand.actuator_lower + margin) | (after >= hand.actuator_upper - margin)
         return bool((at_end & ((lower != 0) | (upper != 0))).any())
+
+
+def _made(pieces: Sequence[Piece], moved: Tensor) -> Sequence[Piece]:
+    """The pieces that a movement came to before it was stopped, the last one in part."""
+    ends = torch.stack([one.action for one in pieces]).cumsum(0)
+    size = (ends[-1] @ ends[-1]).clamp(min=1e-12)
+    done, along = float(moved @ ends[-1] / size), (ends @ ends[-1] / size).tolist()
+    if done > _STOPPED or len(pieces) == 1:
+        return pieces
+    k = next((i for i, end in enumerate(along) if end >= done), len(pieces) - 1)
+    return pieces[: k + 1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
@@ -108,7 +109,8 @@ class OneStep:
             here = PoseTarget(seen.position, seen.rotation)
             grips = controller.decide(seen.state, seen.a, here, seen.fingertip_force)
             if grips.grip is not None and grips.grip.weak:
-                return Plan(target, controller.focus, seen.state, _gripping(grips))
+                grips = dataclasses.replace(grips, turns=False)
+                return Plan(target, controller.focus, seen.state, grips)
         decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
         return Plan(target, controller.focus, seen.state, decision)
 
@@ -152,7 +154,7 @@ class WholeTurn:
         """
         focus = controller.focus
         if firm:
-            decision = self._grip(controller, seen, firm)
+            decision = self._grip(controller, seen, knowledge, firm)
             if decision is not None:
                 return Plan(target, focus, seen.state, decision)
         rehearsal = Rehearsal(controller, seen, target, self.piece, longest)
@@ -187,16 +189,27 @@ class WholeTurn:
         low = (band.force - k * band.force_std).nan_to_num(nan=math.inf)
         return f"a finger may keep only {float(low.min()):.1f} N" if bool((low < self.force).any()) else ""
 
-    def _grip(self, controller: LookAndMoveController, seen: Observation, firm: float) -> Decision | None:
-        """The movement that grips as the object needs it; None: it is gripped so, or grips no better."""
-        rehearsal = Rehearsal(controller, seen, None, self.piece)
-        pieces = list(rehearsal.pieces())
-        first = rehearsal.first
-        if not pieces or first is None or first.grip is None:
+    def _grip(
+        self, controller: LookAndMoveController, seen: Observation, knowledge: HandKnowledge, firm: float
+    ) -> Decision | None:
+        """The movement that grips as the object needs it, as far as it is safe; None: it is gripped so, or
+        grips no better."""
+        here = PoseTarget(seen.position, seen.rotation)
+        rehearsal, bands = (
+            Rehearsal(controller, seen, None, self.piece),
+            Bands(controller, knowledge, seen, here),
+        )
+        waypoints: list[Waypoint] = []
+        for piece, state in rehearsal.pieces():
+            if not waypoints and not _loose(rehearsal.first, firm):
+                return None
+            waypoint = Waypoint(piece, state, bands.add(piece, state))
+            if waypoints and self._against(waypoint.band, first=False):
+                break
+            waypoints.append(waypoint)
+        if not waypoints:
             return None
-        if float(first.grip.force.max()) >= firm * first.grip.wanted and not first.grip.weak:
-            return None
-        return _gripping(_joined(controller, seen, pieces, first))
+        return dataclasses.replace(_joined(controller, seen, waypoints, rehearsal), turns=False)
 
     def _movement(
         self,
@@ -209,34 +222,37 @@ class WholeTurn:
     ) -> Decision:
         """To the last safe waypoint; where there is none one step to first order, if the object is where it
         should be."""
-        first, focus = rehearsal.first, controller.focus
-        assert first is not None
         if waypoints:
-            pieces = [(one.piece, one.state) for one in waypoints]
-            return dataclasses.replace(_joined(controller, seen, pieces, first), band=waypoints[-1].band)
+            return _joined(controller, seen, waypoints, rehearsal)
         decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
         if decision.status is not StopReason.RUNNING:
             return decision
-        after = focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
+        after = controller.focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
         if after > self.off_rotation:
-            return controller.none(StopReason.GIVEN_UP, against, first.desired)
+            return controller.none(StopReason.GIVEN_UP, against, decision.desired)
         return decision
 
 
-def _joined(controller, seen, pieces, first) -> Decision:
-    """One movement of the pieces."""
-    predicted = pieces[-1][1].minus(seen.state)
-    nominal = torch.stack([one.linearization.described_jacobian @ one.action for one, _ in pieces]).sum(0)
+def _joined(
+    controller: LookAndMoveController, seen: Observation, waypoints: Sequence[Waypoint], rehearsal: Rehearsal
+) -> Decision:
+    """One movement through the waypoints."""
+    pieces, predicted = tuple(one.piece for one in waypoints), waypoints[-1].state.minus(seen.state)
+    first, last = rehearsal.first, rehearsal.last
     return Decision(
-        torch.stack([one.action for one, _ in pieces]).sum(0),
+        torch.stack([one.action for one in pieces]).sum(0),
         StopReason.RUNNING,
         controller.focus.matrix @ predicted[-6:],
         predicted,
-        nominal,
-        tuple(one for one, _ in pieces),
-        grip=first.grip,
+        torch.stack([one.linearization.described_jacobian @ one.action for one in pieces]).sum(0),
+        pieces,
+        limited=last is not None and last.limited,
+        grip=None if first is None else first.grip,
+        band=waypoints[-1].band,
     )
 
 
-def _gripping(decision: Decision) -> Decision:
-    return dataclasses.replace(decision, turns=False)
+def _loose(first: Decision | None, firm: float) -> bool:
+    """The grip before anything moves is less than that share of what is wanted, or a finger's is weak."""
+    grip = None if first is None else first.grip
+    return grip is not None and (grip.weak or float(grip.force.max()) < firm * grip.wanted)

@@ -127,9 +127,7 @@ class Consistency:
             )  # fmt: skip
         return tests
 
-    def _drift(
-        self, before: Observation, seen: Observation, expected: Expectation
-    ) -> tuple[Array, Array]:
+    def _drift(self, before: Observation, seen: Observation, expected: Expectation) -> tuple[Array, Array]:
         """beta of each actuator [rad], and its size in standard deviations, by Bayesian least squares on what
         the hand as described predicts: what is learned of it changes meanwhile."""
         n_q, w = self.hand.n_q, expected.moved.numpy()

@@ -1,0 +1,80 @@
+"""Readings during a movement, held against what was planned."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+
+from ...plant import Observation, PlantStatus
+from ...typing import Tensor
+from .safety import Guards
+
+if TYPE_CHECKING:
+    from ..decision import Decision
+    from ..focus import FocusedPose
+
+_DEVIATIONS = 4.0
+_RUNNING = 2  # frames that leave the band: one may be a wrong picture
+_SWINGS = math.radians(1.0)  # [rad] by which a moving object lags behind its equilibrium
+
+
+class OnTheWay:
+    """Whether a movement goes on: no finger presses too hard, the object is held, and near its path.
+
+    The rotation off the focus in a picture is held against that of the path where the encoders were when it
+    was taken, and against the band at the end of the movement.
+
+    Args:
+        guards: limits.
+        focus: what counts as off.
+        seen: where the movement begins.
+        decision: the movement.
+    """
+
+    def __init__(self, guards: Guards, focus: FocusedPose, seen: Observation, decision: Decision) -> None:
+        self._guards, self._focus, self._seen, self._band = guards, focus, seen, decision.band
+        self._ends = torch.stack([one.action for one in decision.pieces]).cumsum(0)
+        self._twists = torch.stack([one.increment[-6:] for one in decision.pieces]).cumsum(0)
+        self._frames = [(seen.taken.encoders, seen.a)]
+        self._off = 0
+        self.why = ""
+        """What stopped the movement; empty: nothing."""
+
+    def __call__(self, seen: Observation) -> bool:
+        """A reading on the way; True: the movement goes on."""
+        self._frames.append((seen.taken.encoders, seen.a))
+        force = seen.fingertip_force
+        if seen.status is PlantStatus.LOST:
+            self.why = "the object is lost"
+        elif force is not None and bool((force > self._guards.force_ceiling).any()):
+            self.why = f"a finger presses with {float(force.max()):.1f} N"
+        elif self._band is not None and seen.status is PlantStatus.HELD:
+            off = self._off_path(seen)
+            most = _DEVIATIONS * self._band.off_std + _SWINGS
+            self._off = self._off + 1 if off > most else 0
+            if self._off >= _RUNNING:
+                self.why = f"the object is {math.degrees(off):.1f} deg off its path"
+        return not self.why
+
+    def _off_path(self, seen: Observation) -> float:
+        """Rotation off the focus that the path does not have where the picture was taken [rad]."""
+        moved = self._encoders(seen.taken.pose) - self._seen.a
+        end = self._ends[-1]
+        done = min(max(float(moved @ end) / max(float(end @ end), 1e-12), 0.0), 1.0)
+        way = self._ends @ end / (end @ end).clamp(min=1e-12)  # of each waypoint along the whole
+        k = min(int((way < done).sum()), len(way) - 1)
+        before = self._twists[k - 1] if k else torch.zeros_like(self._twists[0])
+        start = float(way[k - 1]) if k else 0.0
+        share = (done - start) / max(float(way[k]) - start, 1e-9)
+        planned = before + min(max(share, 0.0), 1.0) * (self._twists[k] - before)
+        return self._focus.off_rotation(seen.state.minus(self._seen.state)[-6:] - planned)
+
+    def _encoders(self, time: float) -> Tensor:
+        """Where they were, between two readings."""
+        later = next((i for i, (at, _) in enumerate(self._frames) if at >= time), len(self._frames) - 1)
+        if later == 0:
+            return self._frames[0][1]
+        (t0, a0), (t1, a1) = self._frames[later - 1], self._frames[later]
+        return a0 + min(max((time - t0) / max(t1 - t0, 1e-9), 0.0), 1.0) * (a1 - a0)
