@@ -10,6 +10,7 @@ import torch
 from torch import nn
 
 from .._checks import check_finite, check_shape
+from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _FURTHEST = 5.0  # priors: bounds of theta
-_NOISE_STD, _LARGEST_STD = 0.25, 20.0  # [N] of a change of force that c and B do not explain
+_LARGEST_STD = 20.0  # [N] of a change of force that c and B do not explain
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
@@ -53,7 +54,7 @@ class ForceSensitivity(Recorded, nn.Module):
         self.theta = nn.Buffer(torch.zeros(n_pads, 1 + n_a, dtype=torch.float64))
         self.evidence = nn.Buffer(torch.zeros(n_pads, 1 + n_a, 1 + n_a, dtype=torch.float64))
         """D, of the motions that each pad measured."""
-        self.variance = nn.Buffer(torch.full((n_pads,), _NOISE_STD**2, dtype=torch.float64))
+        self.variance = nn.Buffer(torch.full((n_pads,), NOISE.force_change**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
         self.drift = nn.Buffer(torch.zeros(n_pads, dtype=torch.float64))
         """d, by which a pad's force changes more than predicted, motion by motion [N]."""
@@ -144,7 +145,7 @@ class ForceSensitivity(Recorded, nn.Module):
         gain = _gain(D, variance, u) / variance[:, None]
         theta[known] += bounded[known, None] * gain[known]
         np.clip(theta, -_FURTHEST, _FURTHEST, out=theta)
-        unexplained = np.clip(bounded**2 - doubt, _NOISE_STD**2, _LARGEST_STD**2)
+        unexplained = np.clip(bounded**2 - doubt, NOISE.force_change**2, _LARGEST_STD**2)
         variance[known] += _RECENT * (unexplained - variance)[known]
         return torch.from_numpy(r)
 
@@ -153,7 +154,7 @@ class ForceSensitivity(Recorded, nn.Module):
         wrong = bound_problems(
             state,
             theta=(-_FURTHEST, _FURTHEST),
-            variance=(_NOISE_STD**2, _LARGEST_STD**2),
+            variance=(NOISE.force_change**2, _LARGEST_STD**2),
             evidence=(-_MOST_EVIDENCE, _MOST_EVIDENCE),
         )
         if wrong:

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from .._checks import check_finite, check_kind, check_shape
+from .._noise import NOISE
 from .._recorded import Recorded
 from ..description import HandDescription
 from ..exceptions import GraspError, StateError
@@ -29,10 +30,6 @@ _COMMON, _OWN = 1.0, 0.4
 _PLAY = 0.5  # of the prior of a backlash: its width where none is described, and how sure it is
 _FURTHEST = 5.0  # priors: bounds
 _IDENTIFIED = 0.7  # of the variance of a figure of its kind without observations
-# [m], [rad], [rad]: what no figures explain of a motion of the object and of a joint; and its share of it
-_POSITION_STD, _ROTATION_STD, _JOINT_STD = 0.3e-3, math.radians(0.2), math.radians(0.5)
-_RELATIVE = 0.08
-_SAME = math.radians(0.02)  # [rad] of an encoder: it has not moved
 
 
 class Figure(NamedTuple):
@@ -191,7 +188,7 @@ class HandFigures(ParameterFilter):
     def begin(self, a: Float[Tensor, " n_a"]) -> None:
         """The next motion begins at these encoders [rad]. Unless the last one ended there the play may stand
         anywhere."""
-        if self._a.shape != a.shape or float((a - self._a).abs().max()) > _SAME:
+        if self._a.shape != a.shape or float((a - self._a).abs().max()) > NOISE.still:
             anywhere = PlayState(*(end.numpy() for end in self._unit.unknown()))
             self._play = anywhere if len(self.width) else None
 
@@ -212,7 +209,7 @@ class HandFigures(ParameterFilter):
         motors = pull.double().numpy().copy()
         wanted = motors[self._at[-1]]
         lost = 0.5 * self._factors[self._is_play] * (self._play.position + np.sign(wanted))
-        motors[self._at[-1]] += lost * (abs(wanted) > _SAME)
+        motors[self._at[-1]] += lost * (abs(wanted) > NOISE.still)
         return torch.from_numpy(motors)
 
     def _pull(self, moved: Tensor) -> tuple[Tensor, Array, PlayState | None]:
@@ -380,7 +377,7 @@ def _noise(predicted: Array, n_joints: int, lever: float) -> Any:
     """R: sensors, and a share of the motion."""
     dq, twist = predicted[:n_joints], predicted[n_joints:]
     unit = np.array([lever] * 3 + [1.0] * 3)
-    std = np.array([_POSITION_STD] * 3 + [_ROTATION_STD] * 3)
-    size = _RELATIVE * np.linalg.norm(twist / unit)
-    of_joints = _JOINT_STD**2 + (_RELATIVE * np.linalg.norm(dq)) ** 2
+    std = np.array([NOISE.position] * 3 + [NOISE.rotation] * 3)
+    size = NOISE.followed * np.linalg.norm(twist / unit)
+    of_joints = NOISE.joint**2 + (NOISE.followed * np.linalg.norm(dq)) ** 2
     return np.concatenate([np.full(n_joints, of_joints), std**2 + (size * unit) ** 2])

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 
+from .._noise import NOISE
 from ..contact import ContactSet, constraint_matrix
 from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..contact.detector import ContactDetector
@@ -20,20 +21,7 @@ from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization
 from ..typing import Float, Tensor
 
-_DEG = math.pi / 180
 _ITERATIONS = 3  # of an update: gaps are not linear in the state
-# standard deviations
-_JOINT = 0.3 * _DEG  # [rad] of a measured joint angle
-_POSITION = 0.2e-3  # [m] of the object's point as the camera sees it, where the plant states no covariance
-_ROTATION = 0.15 * _DEG  # [rad] of its orientation, likewise
-_GAP = 0.05e-3  # [m] of the gap of a pad that measures a force
-# of a joint's predicted motion, as a share of the largest of an actuator: a kinematic model with tendons of
-# another radius predicts joints badly
-_JOINT_DRIFT = 0.5
-_POSE_DRIFT = 0.02  # of the object's predicted motion, as a share of it, on top of what the learner states
-_MODEL_DRIFT = 0.3  # the same of a kinematic model alone, which states nothing
-_SLIP = 0.05  # of the slide of a contact, as a share of its way
-_LEAST_FORCE = 0.3  # [N] a pad that measures less touches nothing, or is dead
 
 
 class Measurement(NamedTuple):
@@ -98,7 +86,7 @@ class PoseFilter:
         """
         n_q = seen.q.shape[-1]
         P = seen.q.new_zeros(n_q + 6, n_q + 6)
-        P[:n_q, :n_q] = _JOINT**2 * torch.eye(n_q, dtype=P.dtype)
+        P[:n_q, :n_q] = NOISE.joint_at_rest**2 * torch.eye(n_q, dtype=P.dtype)
         P[n_q:, n_q:] = self._seen_covariance(pose_covariance, P)
         self.state, self.covariance, self._last = seen, self._permitted(P), None
         self._update(None, fingertip_force)
@@ -131,7 +119,7 @@ class PoseFilter:
             kin = self.kinematic.contact_kinematics(middle, contacts)
             A, v, w = constraint_matrix(kin), *ds[-6:].split(3)
             way = torch.linalg.vector_norm(v + torch.linalg.cross(w.expand_as(kin.lever), kin.lever), dim=-1)
-            slide = (_SLIP * way + 1e-5)[[row // 6 for row in kin.rows]]
+            slide = (NOISE.slip * way + 1e-5)[[row // 6 for row in kin.rows]]
             gain = torch.linalg.solve(A @ Q @ A.mT + torch.diag(slide.square()), A @ Q).mT
             ds, Q = ds - gain @ (A @ ds), Q - gain @ A @ Q
         self.state = self.state.plus(ds)
@@ -140,7 +128,7 @@ class PoseFilter:
     def measure(self, q: Float[Tensor, " n_q"], fingertip_force: Float[Tensor, " n_pads"] | None) -> None:
         """What measured joints [rad] and fingertips [N] say at rest."""
         joints = torch.eye(len(q), len(self.covariance), dtype=q.dtype)
-        variance = _JOINT**2 * torch.eye(len(q), dtype=q.dtype)
+        variance = NOISE.joint_at_rest**2 * torch.eye(len(q), dtype=q.dtype)
         self._update(Measurement(joints, lambda at: q - at.q, variance), fingertip_force)
 
     def look(self, seen: GraspState, pose_covariance: Float[Tensor, "6 6"] | None = None) -> None:
@@ -152,7 +140,8 @@ class PoseFilter:
     def _seen_covariance(self, stated: Tensor | None, like: Tensor) -> Tensor:
         if stated is not None and bool(torch.isfinite(stated).all()):
             return stated.to(like)
-        return torch.diag(like.new_tensor([_POSITION] * 3 + [_ROTATION] * 3).square())
+        std = [NOISE.position_at_rest] * 3 + [NOISE.rotation_at_rest] * 3
+        return torch.diag(like.new_tensor(std).square())
 
     def _linearize(self, moved: Tensor, fingertip_force: Tensor | None) -> Linearization | None:
         """The model at the state, with forces carried along from motion to motion; None: it refuses."""
@@ -172,9 +161,9 @@ class PoseFilter:
         unit = moved.new_tensor([CHARACTERISTIC_LENGTH] * 3 + [1.0] * 3)
         share, size = 1.0, largest
         if ds is not None:
-            share = _MODEL_DRIFT if self.enhanced is None else _POSE_DRIFT
+            share = NOISE.described if self.enhanced is None else NOISE.learned
             size = torch.linalg.vector_norm(ds[n_q:] / unit)
-        std = torch.cat([_JOINT_DRIFT * largest.expand(n_q), share * size * unit])
+        std = torch.cat([NOISE.joint_motion * largest.expand(n_q), share * size * unit])
         return self._permitted(torch.diag(std.square() + 1e-14 + unsure))
 
     def _permitted(self, covariance: Tensor) -> Tensor:
@@ -196,7 +185,7 @@ class PoseFilter:
             pressing = contacts.gap <= self.kinematic.options.contact_margin
         else:
             pads = self.kinematic.hand.pad_indices(contacts.finger)
-            pressing = fingertip_force[pads] >= _LEAST_FORCE
+            pressing = fingertip_force[pads] >= NOISE.pressing_at_least
         rows = torch.nonzero(pressing).flatten().tolist()
         if not rows:
             raise NoContactError("no pad measures a force")
@@ -219,7 +208,7 @@ class PoseFilter:
                     kin = self.kinematic.contact_kinematics(at, contacts)
                     closing = constraint_matrix(kin)[kin.normal_rows]  # gap(s + ds) = gap - closing ds
                     H, miss = torch.cat([H, closing]), torch.cat([miss, contacts.gap])
-                    gap = P.new_full((len(closing),), _GAP).square()
+                    gap = P.new_full((len(closing),), NOISE.gap_of_estimate).square()
                     noise = torch.block_diag(noise, torch.diag(gap))
             gain = torch.linalg.solve(H @ P @ H.mT + noise, H @ P).mT
             ds = gain @ (miss + H @ ds)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._noise import NOISE
 from ..description import HandDescription
 from ..exceptions import StateError
 from ..kinematics import ServoModel
@@ -21,8 +22,8 @@ _OUTLIER = 4.0  # z of motions that nothing is learned from
 _GAVE = 5.0  # [deg] a tendon that gives more in one motion does not hold
 _WORTH = 5.0  # motions: the first guess of the noise
 _PRIORS = {  # before the first motion: figures, their standard deviations, that of the noise [rad]
-    "tendon": ((0.7,), (0.4,), 0.7 * _DEG),
-    "servo": ((0.0, 0.0), (1.5 * _DEG, 0.5 * _DEG), 0.15 * _DEG),
+    "tendon": ((0.7,), (0.4,), NOISE.tendon),
+    "servo": ((0.0, 0.0), (NOISE.dead_zone_in_logs, NOISE.bias_in_logs), NOISE.servo_in_logs),
 }
 
 
