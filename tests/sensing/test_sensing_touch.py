@@ -7,6 +7,7 @@ import dataclasses
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -79,6 +80,21 @@ def test_without_fingertip_sensors_pads_touch_whose_gaps_the_joints_explain(hand
     assert float(off[[i for i in range(len(off)) if i != thumb]].max()) < 0.5
     lifted = ContactAligned(Blurred(hand, index_2, -0.15, numb=True), hand.hand, hand.object).reset(0)
     assert float(lifted.q[index_2] - lifted.truth.q[index_2]) == pytest.approx(-0.15, abs=2e-3)
+
+
+def test_gaps_enter_by_gauss_newton(hand: SimulatedHand, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gain(mean, P, residual, H, R, at, bounds):
+        K = np.linalg.solve(H @ P @ H.T + np.diag(R), H @ P).T
+        return np.clip(mean + K @ (residual + H @ (at - mean)), *bounds), P - K @ H @ P
+
+    thumb = hand.hand.joint_names.index("thumb_0")
+    plants = [ContactAligned(Blurred(hand, thumb, 0.1), hand.hand, hand.object) for _ in range(2)]
+    seen = plants[0].plant.reset(0)
+    found = [plants[0].observation(seen)]
+    monkeypatch.setattr("torch_ekm.sensing.contact_alignment.update", gain)
+    found.append(plants[1].observation(seen))
+    torch.testing.assert_close(found[0].q, found[1].q, rtol=0, atol=1e-12)
+    torch.testing.assert_close(plants[0]._last[1], plants[1]._last[1], rtol=1e-9, atol=1e-15)
 
 
 def test_the_error_of_a_cable_lasts() -> None:

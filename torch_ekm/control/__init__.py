@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from ..enhanced.hand_figures import DescribedFigures, HandFigures
+from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.hand_figures import DescribedFigures, HandFigures
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, StopReason
 from .focus import Direction, FocusedPose, PoseTarget
-from .force_sensitivity import ForceSensitivity
 from .journal import Journal
 from .knowledge import HandKnowledge
 from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit

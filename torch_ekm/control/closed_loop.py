@@ -14,7 +14,7 @@ import torch
 
 from .._checks import check_kind
 from .._extras import require
-from ..enhanced.hand_figures import DescribedFigures, HandFigures
+from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..model import Linearization
 from ..plant import Gate, Observation, Plant, PlantStatus, ServoInverse
 from ..residual import UpdateReport

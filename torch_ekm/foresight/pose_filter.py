@@ -16,6 +16,7 @@ from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..contact.detector import ContactDetector
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
+from ..estimation.update import update
 from ..exceptions import GraspError, NoContactError
 from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization
@@ -120,10 +121,9 @@ class PoseFilter:
             A, v, w = constraint_matrix(kin), *ds[-6:].split(3)
             way = torch.linalg.vector_norm(v + torch.linalg.cross(w.expand_as(kin.lever), kin.lever), dim=-1)
             slide = (NOISE.slip * way + 1e-5)[[row // 6 for row in kin.rows]]
-            gain = torch.linalg.solve(A @ Q @ A.mT + torch.diag(slide.square()), A @ Q).mT
-            ds, Q = ds - gain @ (A @ ds), Q - gain @ A @ Q
+            ds, Q = _conditioned(ds, Q, -A @ ds, A, slide.square())
         self.state = self.state.plus(ds)
-        self.covariance = self.covariance + 0.5 * (Q + Q.mT)
+        self.covariance = self.covariance + Q
 
     def measure(self, q: Float[Tensor, " n_q"], fingertip_force: Float[Tensor, " n_pads"] | None) -> None:
         """What measured joints [rad] and fingertips [N] say at rest."""
@@ -196,7 +196,7 @@ class PoseFilter:
     ) -> None:
         """Condition on a measurement ``H ds = miss(s) +- noise``, and on the gaps of pads that press."""
         prior, P = self.state, self.covariance
-        ds, H, gain, noise = torch.zeros_like(P[0]), P[:0], P[:, :0], P[:0, :0]
+        ds = torch.zeros_like(P[0])
         for _ in range(_ITERATIONS):
             at = prior.plus(ds)
             H, miss, noise = P[:0], P[0, :0], P[:0, :0]
@@ -210,8 +210,13 @@ class PoseFilter:
                     H, miss = torch.cat([H, closing]), torch.cat([miss, contacts.gap])
                     gap = P.new_full((len(closing),), NOISE.gap_of_estimate).square()
                     noise = torch.block_diag(noise, torch.diag(gap))
-            gain = torch.linalg.solve(H @ P @ H.mT + noise, H @ P).mT
-            ds = gain @ (miss + H @ ds)
-        keep = torch.eye(len(P), dtype=P.dtype) - gain @ H
+            ds, self.covariance = _conditioned(0 * ds, P, miss, H, noise, at=ds)
         self.state = prior.plus(ds)
-        self.covariance = keep @ P @ keep.mT + gain @ noise @ gain.mT
+
+
+def _conditioned(
+    mean: Tensor, P: Tensor, residual: Tensor, H: Tensor, R: Tensor, at: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    seen, point = (part.numpy() for part in (mean, P, residual, H, R)), None if at is None else at.numpy()
+    mean, P = map(torch.from_numpy, update(*seen, at=point))
+    return mean, P

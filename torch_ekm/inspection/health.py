@@ -10,6 +10,7 @@ import numpy as np
 
 from .._noise import NOISE
 from ..description import HandDescription
+from ..estimation.update import update
 from ..exceptions import StateError
 from ..kinematics import ServoModel
 from ..plant import PlantStatus, Trajectory
@@ -117,9 +118,8 @@ class _Watch:
         return y - float(self.theta @ x)
 
     def learn(self, x: Array, y: float) -> None:
-        Px, error = self.P @ x, self.error(x, y)
-        spread, noise = 1 + float(x @ Px), self.squares / self.weight
-        self.theta, self.P = self.theta + Px * (error / spread), self.P - np.outer(Px, Px) / spread
+        error, spread, noise = self.error(x, y), 1 + float(x @ self.P @ x), self.squares / self.weight
+        self.theta, self.P = update(self.theta, self.P, np.array([error]), x[None], np.ones(1))
         self.weight, self.squares = self.weight + 1, self.squares + min(error**2 / spread, 9 * noise)
         self.count += 1
 

@@ -10,6 +10,7 @@ from .._warnings import warn
 from ..contact.contact_kinematics import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
+from ..estimation.update import update
 from ..kinematics import HandKinematics
 from ..plant import Observation, Plant, PlantWrapper
 from ..typing import Float, Tensor
@@ -55,10 +56,10 @@ class ContactAligned(PlantWrapper):
         self.hand = hand
         self._detector = ContactDetector(hand, obj, margin=math.inf)
         self._kinematics = HandKinematics(hand)
-        self._range = tuple(torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
+        self._range = hand.joint_lower, hand.joint_upper
         sensed = {sensor.joint for sensor in hand.hall_sensors}
         std = [NOISE.joint if name in sensed else NOISE.unsensed_joint for name in hand.joint_names]
-        moves = self._range[1] > self._range[0]
+        moves = torch.from_numpy(hand.joint_upper > hand.joint_lower)
         self._last: tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"]] | None = None
         """What each joint took at the last observation [rad], and the variance that is left [rad^2]."""
         self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
@@ -96,14 +97,13 @@ class ContactAligned(PlantWrapper):
         self, seen: Observation, expected: Float[Tensor, " n_q"], P: Float[Tensor, "n_q n_q"], pads: list[str]
     ) -> tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"], Float[Tensor, " n"]]:
         """Joints, the variance that the gaps leave them [rad^2], and the gaps that stay [m]."""
-        R = NOISE.gap**2 * torch.eye(len(pads), dtype=P.dtype)
-        q, left, gap = expected, P.diagonal(), P.new_zeros(0)
+        q, left, gap = expected, P, P.new_zeros(0)
         for _ in range(_ITERATIONS if pads else 0):
             before, (gap, H) = q, self._gaps(seen, q, pads)
-            gain = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
-            q = (expected - gain @ (gap + H @ (expected - q))).clamp(*self._range)
-            left, gap = (P - gain @ H @ P).diagonal(), gap + H @ (q - before)
-        return q, left, gap
+            given = (part.numpy() for part in (expected, P, -gap, H, gap.new_full(gap.shape, NOISE.gap**2)))
+            q, left = map(torch.from_numpy, update(*given, at=q.numpy(), bounds=self._range))
+            gap = gap + H @ (q - before)
+        return q, left.diagonal(), gap
 
     def _doubted(
         self,

@@ -13,10 +13,10 @@ from .._checks import check_finite, check_shape
 from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
+from .update import update
 
 if TYPE_CHECKING:
     from ..model import Linearization
-    from .pace import ForceSurprise
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _FURTHEST = 5.0  # priors: bounds of theta
@@ -33,8 +33,8 @@ class ForceSensitivity(Recorded, nn.Module):
 
         u = [S w; 20 w],  theta = [c - 1; B / 20]        prior N(0, I)
         r = (f_n+ - f_n) - S w - theta u                 of each pad that measures
-        D <- D - (1 - .97) D u u' D / (u' D u) + u u'    motions, forgotten in the direction of a new one
-        theta <- theta + P u r / s^2,  P = (D / s^2 + I)^-1
+        D <- D - (1 - .97) D u u' D / (u' D u)           motions, forgotten in the direction of a new one
+        theta <- update(theta, (D / s^2 + I)^-1, r, u', s^2),  D <- D + u u'
         d <- .5 d + .3 r                                 what motions in succession leave alike
         s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .25^2)      what is left: a pad that rubs teaches less
 
@@ -67,8 +67,8 @@ class ForceSensitivity(Recorded, nn.Module):
     @property
     def scale_std(self) -> Float[Tensor, " n_pads"]:
         """Standard error of c."""
-        information = self.evidence / self.variance[:, None, None] + torch.eye(self.theta.shape[-1]).double()
-        return torch.linalg.inv(information)[:, 0, 0].sqrt()
+        P = _covariance(self.evidence.numpy(), self.variance.numpy())
+        return torch.from_numpy(P[:, 0, 0]).sqrt()
 
     @property
     def correction(self) -> Float[Tensor, "n_pads n_a"]:
@@ -89,8 +89,9 @@ class ForceSensitivity(Recorded, nn.Module):
         """A new grasp: nothing drifts yet."""
         self.drift.zero_()
 
-    def learn(self, lin: Linearization, moved: Float[Tensor, " n_a"], felt: ForceSurprise) -> None:
-        """Pads that touched and measured before and after a motion teach how their forces answer."""
+    def learn(self, lin: Linearization, moved: Float[Tensor, " n_a"], felt: Any) -> None:
+        """Pads that touched and measured before and after a motion teach how their forces answer. ``felt``
+        has ``pads``, and ``before``, ``after`` and ``surprise`` of each [N]."""
         pads = list(felt.pads)
         change = torch.full((len(self.theta),), torch.nan, dtype=torch.float64)
         change[pads] = (felt.after - felt.before).where(~felt.surprise.isnan(), torch.nan)
@@ -134,17 +135,17 @@ class ForceSensitivity(Recorded, nn.Module):
         known = ~np.isnan(r)
         if not known.any() or not w.any():
             return torch.from_numpy(r)
-        doubt = (_gain(D, variance, u) * u).sum(-1)  # u' P u
+        doubt = ((_covariance(D, variance) @ u[..., None])[..., 0] * u).sum(-1)  # u' P u
         spread = np.sqrt(variance + doubt)
         Du = (D @ u[..., None])[..., 0]
         seen = np.maximum((Du * u).sum(-1), np.finfo(float).tiny)[:, None, None]
-        forgotten = (1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen
-        D[known] += (u[:, :, None] * u[:, None, :] - forgotten)[known]
+        D[known] -= ((1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen)[known]
         bounded = np.clip(r, -_CLIP * spread, _CLIP * spread)
         drift[known] = (_KEPT * drift + _TAKEN * bounded)[known]
-        gain = _gain(D, variance, u) / variance[:, None]
-        theta[known] += bounded[known, None] * gain[known]
-        np.clip(theta, -_FURTHEST, _FURTHEST, out=theta)
+        one = bounded[:, None], u[:, None, :], variance[:, None]
+        after, _ = update(theta, _covariance(D, variance), *one, bounds=(-_FURTHEST, _FURTHEST))
+        theta[known] = after[known]
+        D[known] += (u[:, :, None] * u[:, None, :])[known]
         unexplained = np.clip(bounded**2 - doubt, NOISE.force_change**2, _LARGEST_STD**2)
         variance[known] += _RECENT * (unexplained - variance)[known]
         return torch.from_numpy(r)
@@ -169,7 +170,6 @@ class ForceSensitivity(Recorded, nn.Module):
         return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"
 
 
-def _gain(D: Array, variance: Array, u: Array) -> Any:
-    """``P u`` of each pad."""
-    information = D / variance[:, None, None] + np.eye(u.shape[-1])
-    return np.linalg.solve(information, u[..., None])[..., 0]
+def _covariance(D: Array, variance: Array) -> Any:
+    """P of each pad."""
+    return np.linalg.inv(D / variance[:, None, None] + np.eye(D.shape[-1]))

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torch_ekm.control.force_sensitivity import ForceSensitivity
+from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import NonFiniteError, ShapeError
 
 NAN = math.nan
@@ -49,8 +49,8 @@ def test_it_scales_what_a_stiffer_description_says_everywhere() -> None:
 
 
 def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch_ekm.control.force_sensitivity._FORGETTING", 1.0)
-    monkeypatch.setattr("torch_ekm.control.force_sensitivity._RECENT", 0.0)
+    monkeypatch.setattr("torch_ekm.estimation.force_sensitivity._FORGETTING", 1.0)
+    monkeypatch.setattr("torch_ekm.estimation.force_sensitivity._RECENT", 0.0)
     true, w = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), moves(8)
     learner = taught(true, torch.zeros_like(true), w)
     y, s, p = w @ true[0], 0.25, 20.0
