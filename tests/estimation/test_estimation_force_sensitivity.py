@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from torch_ekm._noise import NOISE
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import NonFiniteError, ShapeError
 
@@ -53,7 +54,7 @@ def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.
     monkeypatch.setattr("torch_ekm.estimation.force_sensitivity._RECENT", 0.0)
     true, w = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), moves(8)
     learner = taught(true, torch.zeros_like(true), w)
-    y, s, p = w @ true[0], 0.25, 20.0
+    y, s, p = w @ true[0], NOISE.force, 20.0
     exact = torch.linalg.solve(w.mT @ w / s**2 + torch.eye(3, dtype=F64) / p**2, w.mT @ y / s**2)  # S = 0
     torch.testing.assert_close(learner.correction[0], exact)
 

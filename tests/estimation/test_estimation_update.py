@@ -84,7 +84,7 @@ def test_forces_are_learned_by_least_squares_with_directional_forgetting(draw) -
     n_pads, n_a = 2, 3
     learner = ForceSensitivity(n_pads, n_a)
     eye = np.eye(1 + n_a)
-    theta, D, s2 = np.zeros((n_pads, 1 + n_a)), np.zeros((n_pads, 1 + n_a, 1 + n_a)), np.full(n_pads, 0.25**2)
+    theta, D, s2 = np.zeros((n_pads, 1 + n_a)), np.zeros((n_pads, 1 + n_a, 1 + n_a)), np.full(n_pads, 0.3**2)
     for k in range(80):
         w, S = 0.1 * draw.normal(size=n_a), 10 * draw.normal(size=(n_pads, n_a))
         change = 0.6 * S @ w + 0.3 * draw.normal(size=n_pads) - 20.0 * (k == 50)
@@ -99,7 +99,7 @@ def test_forces_are_learned_by_least_squares_with_directional_forgetting(draw) -
             D[pad] += np.outer(u, u) - 0.03 * np.outer(Du, Du) / max(u @ Du, np.finfo(float).tiny)
             theta[pad] += np.linalg.solve(D[pad] / s2[pad] + eye, u) * r / s2[pad]
             theta[pad] = np.clip(theta[pad], -5, 5)
-            s2[pad] += 0.1 * (np.clip(r**2 - doubt, 0.25**2, 400) - s2[pad])
+            s2[pad] += 0.1 * (np.clip(r**2 - doubt, 0.3**2, 400) - s2[pad])
         np.testing.assert_allclose(learner.theta, theta, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(learner.evidence, D, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(learner.variance, s2, rtol=1e-12)

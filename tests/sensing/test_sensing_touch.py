@@ -7,7 +7,6 @@ import dataclasses
 import math
 import warnings
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -84,8 +83,8 @@ def test_without_fingertip_sensors_pads_touch_whose_gaps_the_joints_explain(hand
 
 def test_gaps_enter_by_gauss_newton(hand: SimulatedHand, monkeypatch: pytest.MonkeyPatch) -> None:
     def gain(mean, P, residual, H, R, at, bounds):
-        K = np.linalg.solve(H @ P @ H.T + np.diag(R), H @ P).T
-        return np.clip(mean + K @ (residual + H @ (at - mean)), *bounds), P - K @ H @ P
+        K = torch.linalg.solve(H @ P @ H.T + torch.diag(R), H @ P).T
+        return (mean + K @ (residual + H @ (at - mean))).numpy().clip(*bounds), (P - K @ H @ P).numpy()
 
     thumb = hand.hand.joint_names.index("thumb_0")
     plants = [ContactAligned(Blurred(hand, thumb, 0.1), hand.hand, hand.object) for _ in range(2)]

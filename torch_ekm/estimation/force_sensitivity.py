@@ -19,13 +19,11 @@ if TYPE_CHECKING:
     from ..model import Linearization
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
-_FURTHEST = 5.0  # priors: bounds of theta
 _LARGEST_STD = 20.0  # [N] of a change of force that c and B do not explain
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 _KEPT, _TAKEN = 0.5, 0.3  # of the drift before, of the last motion
-_CLIP = 4.0  # standard deviations; a contact that slips says nothing of the rest
 
 
 class ForceSensitivity(Recorded, nn.Module):
@@ -36,7 +34,7 @@ class ForceSensitivity(Recorded, nn.Module):
         D <- D - (1 - .97) D u u' D / (u' D u)           motions, forgotten in the direction of a new one
         theta <- update(theta, (D / s^2 + I)^-1, r, u', s^2),  D <- D + u u'
         d <- .5 d + .3 r                                 what motions in succession leave alike
-        s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .25^2)      what is left: a pad that rubs teaches less
+        s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .3^2)       what is left: a pad that rubs teaches less
 
     c of each pad scales what the model says: a hand that gives more than it is described to presses less. B
     ``(n_pads, n_a)`` says the rest. Both belong to the hand: they are kept from grasp to grasp. The drift d
@@ -54,7 +52,7 @@ class ForceSensitivity(Recorded, nn.Module):
         self.theta = nn.Buffer(torch.zeros(n_pads, 1 + n_a, dtype=torch.float64))
         self.evidence = nn.Buffer(torch.zeros(n_pads, 1 + n_a, 1 + n_a, dtype=torch.float64))
         """D, of the motions that each pad measured."""
-        self.variance = nn.Buffer(torch.full((n_pads,), NOISE.force_change**2, dtype=torch.float64))
+        self.variance = nn.Buffer(torch.full((n_pads,), NOISE.force**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
         self.drift = nn.Buffer(torch.zeros(n_pads, dtype=torch.float64))
         """d, by which a pad's force changes more than predicted, motion by motion [N]."""
@@ -140,13 +138,14 @@ class ForceSensitivity(Recorded, nn.Module):
         Du = (D @ u[..., None])[..., 0]
         seen = np.maximum((Du * u).sum(-1), np.finfo(float).tiny)[:, None, None]
         D[known] -= ((1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen)[known]
-        bounded = np.clip(r, -_CLIP * spread, _CLIP * spread)
+        most = NOISE.outlier * spread  # a contact that slips says nothing of the rest
+        bounded = np.clip(r, -most, most)
         drift[known] = (_KEPT * drift + _TAKEN * bounded)[known]
         one = bounded[:, None], u[:, None, :], variance[:, None]
-        after, _ = update(theta, _covariance(D, variance), *one, bounds=(-_FURTHEST, _FURTHEST))
+        after, _ = update(theta, _covariance(D, variance), *one, bounds=(-NOISE.furthest, NOISE.furthest))
         theta[known] = after[known]
         D[known] += (u[:, :, None] * u[:, None, :])[known]
-        unexplained = np.clip(bounded**2 - doubt, NOISE.force_change**2, _LARGEST_STD**2)
+        unexplained = np.clip(bounded**2 - doubt, NOISE.force**2, _LARGEST_STD**2)
         variance[known] += _RECENT * (unexplained - variance)[known]
         return torch.from_numpy(r)
 
@@ -154,8 +153,8 @@ class ForceSensitivity(Recorded, nn.Module):
         """What is wrong with the entries of a state that is to be loaded."""
         wrong = bound_problems(
             state,
-            theta=(-_FURTHEST, _FURTHEST),
-            variance=(NOISE.force_change**2, _LARGEST_STD**2),
+            theta=(-NOISE.furthest, NOISE.furthest),
+            variance=(0.5 * NOISE.force**2, _LARGEST_STD**2),  # files of a smaller noise hold
             evidence=(-_MOST_EVIDENCE, _MOST_EVIDENCE),
         )
         if wrong:

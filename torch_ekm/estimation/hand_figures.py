@@ -28,7 +28,6 @@ KINDS = ("springs", "moment_arms", "stiffness", "backlash")
 # of the prior, in units of those of the calibration: one lathe turns all pulleys, one cable strings them
 _COMMON, _OWN = 1.0, 0.4
 _PLAY = 0.5  # of the prior of a backlash: its width where none is described, and how sure it is
-_FURTHEST = 5.0  # priors: bounds
 _IDENTIFIED = 0.7  # of the variance of a figure of its kind without observations
 
 
@@ -128,7 +127,7 @@ class HandFigures(ParameterFilter):
         play = torch.tensor([not one.logarithmic for one in found])
         scale = torch.where(play, _PLAY, 1.0).double()
         start = [_PLAY * (not one.logarithmic and one.nominal == 0) for one in found]
-        lower, upper = [one.lowest for one in found], [_FURTHEST] * len(found)
+        lower, upper = [one.lowest for one in found], [NOISE.furthest] * len(found)
         super().__init__([one.label for one in found], start, scale[:, None] * prior * scale, lower, upper)
         self._is_play, self._unit = play.numpy(), Play(torch.full((int(play.sum()),), 2.0).double())
         self._play: PlayState | None = None  # in units of half the widths
@@ -377,7 +376,7 @@ def _noise(predicted: Array, n_joints: int, lever: float) -> Any:
     """R: sensors, and a share of the motion."""
     dq, twist = predicted[:n_joints], predicted[n_joints:]
     unit = np.array([lever] * 3 + [1.0] * 3)
-    std = np.array([NOISE.position] * 3 + [NOISE.rotation] * 3)
-    size = NOISE.followed * np.linalg.norm(twist / unit)
-    of_joints = NOISE.joint**2 + (NOISE.followed * np.linalg.norm(dq)) ** 2
+    std = np.array(NOISE.pose)
+    size = NOISE.share * np.linalg.norm(twist / unit)
+    of_joints = NOISE.joint**2 + (NOISE.share * np.linalg.norm(dq)) ** 2
     return np.concatenate([np.full(n_joints, of_joints), std**2 + (size * unit) ** 2])

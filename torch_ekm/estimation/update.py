@@ -8,13 +8,13 @@ from ..typing import AnyArray, Array, Float
 
 
 def update(
-    mean: Float[Array, "*batch n"],
-    P: Float[Array, "*batch n n"],
-    residual: Float[Array, "*batch m"],
-    H: Float[Array, "*batch m n"],
-    R: Float[Array, "*batch m"] | Float[Array, "*batch m m"],
+    mean: Float[AnyArray, "*batch n"],
+    P: Float[AnyArray, "*batch n n"],
+    residual: Float[AnyArray, "*batch m"],
+    H: Float[AnyArray, "*batch m n"],
+    R: Float[AnyArray, "*batch m"] | Float[AnyArray, "*batch m m"],
     *,
-    at: Float[Array, "*batch n"] | None = None,
+    at: Float[AnyArray, "*batch n"] | None = None,
     bounds: tuple[AnyArray, AnyArray] | None = None,
 ) -> tuple[Array, Array]:
     """``x ~ N(m, P)`` given ``y = h(x) + N(0, R)``, with h linearized at ``x_0``::
@@ -27,7 +27,7 @@ def update(
     the likelihood. An observation that counts with the weight w has the noise R / w.
 
     Args:
-        mean, P: m and P before it.
+        mean, P: m and P before it; tensors will do, too.
         residual: ``y - h(x_0)``.
         H: dh/dx at x_0.
         R: covariance of the noise, or its diagonal.
@@ -40,10 +40,11 @@ def update(
     Source: Bell and Cathey, IEEE Trans. Automatic Control 38(2), 1993 (repeated); Bucy and Joseph, Filtering
     for Stochastic Processes (1968).
     """
+    mean, P, residual, H, R = map(np.asarray, (mean, P, residual, H, R))
     noise = R if R.ndim == H.ndim else R[..., None] * np.eye(R.shape[-1])
     HP = H @ P
     K = np.linalg.solve(HP @ H.mT + noise, HP).mT
-    r = residual if at is None else residual + (H @ (at - mean)[..., None])[..., 0]
+    r = residual if at is None else residual + (H @ (np.asarray(at) - mean)[..., None])[..., 0]
     mean = mean + (K @ r[..., None])[..., 0]
     left = np.eye(P.shape[-1]) - K @ H
     P = left @ P @ left.mT + K @ noise @ K.mT

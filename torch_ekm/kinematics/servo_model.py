@@ -187,7 +187,7 @@ class ServoModel(Recorded, nn.Module):
         noise = at.squares[went] / at.weight[went]
         error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
-        self._open(at, error**2 > 16 * noise * spread, went)
+        self._open(at, error**2 > NOISE.outlier**2 * noise * spread, went)
         error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
         at.estimate[went] += Px * (error / spread)[:, None]
@@ -196,7 +196,8 @@ class ServoModel(Recorded, nn.Module):
         small = (faded[:, [0, 1], [0, 1]] <= self._prior.diagonal().numpy()).all(-1)
         at.covariance[went] = np.where(small[:, None, None], faded, P)
         # bounded: a servo that has become another one is not a noisy one
-        square = np.clip(error**2 / spread, _LEAST_STD**2, np.minimum(16 * noise, self.largest**2))
+        most = np.minimum(NOISE.outlier**2 * noise, self.largest**2)
+        square = np.clip(error**2 / spread, _LEAST_STD**2, most)
         at.weight[went] = _FORGETTING * at.weight[went] + 1
         at.squares[went] = _FORGETTING * at.squares[went] + square
 
@@ -210,7 +211,7 @@ class ServoModel(Recorded, nn.Module):
             return ((x * at.estimate[stood]).sum(-1) - abs(v[stood])) / np.sqrt(noise * spread)
 
         Px, spread = _spread(at, x, stood)
-        self._open(at, excess(spread) < -4, stood)
+        self._open(at, excess(spread) < -NOISE.outlier, stood)
         Px, spread = _spread(at, x, stood)
         z = excess(spread)
         beyond = torch.special.log_ndtr(torch.from_numpy(z)).numpy()

@@ -100,8 +100,8 @@ class ContactAligned(PlantWrapper):
         q, left, gap = expected, P, P.new_zeros(0)
         for _ in range(_ITERATIONS if pads else 0):
             before, (gap, H) = q, self._gaps(seen, q, pads)
-            given = (part.numpy() for part in (expected, P, -gap, H, gap.new_full(gap.shape, NOISE.gap**2)))
-            q, left = map(torch.from_numpy, update(*given, at=q.numpy(), bounds=self._range))
+            R = gap.new_full(gap.shape, NOISE.gap**2)
+            q, left = map(torch.from_numpy, update(expected, P, -gap, H, R, at=q, bounds=self._range))
             gap = gap + H @ (q - before)
         return q, left.diagonal(), gap
 

@@ -14,11 +14,11 @@ class ForceOptions:
         ParameterError: a value outside its range.
     """
 
-    torque_std: float = NOISE.torque
+    torque_std: float = 0.01
     """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
     normal_std: float = NOISE.force
     """Standard deviation of a measured normal force [N]."""
-    start_std: float = NOISE.any_contact_force
+    start_std: float = 1.5
     """Standard deviation of a contact force of which nothing is known yet, per axis [N]."""
 
     def __post_init__(self) -> None:

@@ -20,10 +20,10 @@ from .motions import Rest
 from .parameters import Figures, Unknowns
 
 GROUPS = {
-    "joints": NOISE.joint_at_rest,
-    "position": NOISE.position_at_rest,
-    "rotation": NOISE.rotation_at_rest,
-    "encoder": NOISE.encoder_taut,
+    "joints": NOISE.joint,
+    "position": NOISE.position,
+    "rotation": NOISE.rotation,
+    "encoder": NOISE.joint,
     "equilibrium": 1.0,
 }
 """Standard deviations at the start: of a measured motion [rad], [m], [rad], of an encoder against joints and
