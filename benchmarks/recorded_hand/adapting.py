@@ -9,7 +9,7 @@ import torch
 
 from torch_ekm.contact.contact_set import VARYING
 from torch_ekm.description import HandDescription
-from torch_ekm.enhanced.hand_figures import HandFigures
+from torch_ekm.estimation.hand_figures import HandFigures
 from torch_ekm.exceptions import GraspError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, Linearization

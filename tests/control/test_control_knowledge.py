@@ -19,9 +19,9 @@ from torch_ekm.control import (
     PoseTarget,
     StopReason,
 )
-from torch_ekm.control.force_sensitivity import ForceSensitivity
 from torch_ekm.control.knowledge import previous
 from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
+from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
 from torch_ekm.kinematics import ServoModel
 from torch_ekm.kinematics.servo_model import IdealServos

@@ -8,6 +8,7 @@ import math
 import pytest
 import torch
 
+from torch_ekm._noise import NOISE
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.foresight import BlindPose, pose_filter
 from torch_ekm.kinematics.se3 import exp
@@ -16,7 +17,7 @@ from torch_ekm.plant import Observation, Plant, PlantStatus, PlantWrapper
 from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
-JOINT, POSITION, ROTATION = 0.3 * DEG, 2e-4, 0.15 * DEG
+JOINT, POSITION, ROTATION = NOISE.joint, NOISE.position, NOISE.rotation
 MOTIONS = 4
 
 
@@ -81,7 +82,7 @@ def missed(plant: BlindPose, seen: Observation) -> torch.Tensor:
 def test_joints_and_touch_find_what_the_prediction_misses(turned, monkeypatch) -> None:
     hand, made = turned
     assert float(hand.rotation_axis @ made[-1].truth.state.minus(made[0].truth.state)[-3:]) > 6 * DEG
-    monkeypatch.setattr(pose_filter, "_JOINT", 1e-3 * DEG)
+    monkeypatch.setattr(pose_filter, "NOISE", dataclasses.replace(NOISE, joint=1e-3 * DEG))
     plant, seen = blind(turned, scale=0.0)
     alone, predicted = blind(turned, scale=0.0, touch=False)
     error, of_prediction = (
@@ -118,8 +119,24 @@ def test_the_stated_uncertainty_holds(turned) -> None:
     assert stds[-1] < 1.2 * DEG
 
 
+def test_rolling_joints_and_gaps_enter_by_the_update_of_a_kalman_filter(turned, monkeypatch) -> None:
+    def gain(mean, P, residual, H, R, at=None):
+        R = torch.diag(R) if R.dim() == 1 else R
+        K = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
+        if at is not None:
+            residual = residual + H @ (at - mean)
+        P = (P + P.mT - K @ H @ P - (K @ H @ P).mT) / 2
+        return (mean + K @ residual).numpy(), P.numpy()
+
+    found, _ = blind(turned)
+    monkeypatch.setattr(pose_filter, "update", gain)
+    plain, _ = blind(turned)
+    assert float(found.filter.state.minus(plain.filter.state).abs().max()) < 1e-12
+    torch.testing.assert_close(found.filter.covariance, plain.filter.covariance, rtol=1e-9, atol=1e-15)
+
+
 def test_the_camera_is_asked_when_the_uncertainty_says_so(turned) -> None:
-    plant, seen = blind(turned, look_again=0.5 * DEG)
+    plant, seen = blind(turned, look_again=0.7 * DEG)
     looked = [s.info["estimate"]["looked"] for s in seen]
     assert plant.looks == sum(looked) > 0
     assert not looked[0]

@@ -11,7 +11,7 @@ from model_icub import gripped
 from model_toys import planar_two_finger, soft_two_finger, three_finger
 
 from torch_ekm.contact.contact_set import VARYING
-from torch_ekm.enhanced.hand_figures import HandFigures
+from torch_ekm.estimation.hand_figures import HandFigures
 from torch_ekm.kinematics import GraspState
 
 F64 = torch.float64

@@ -11,7 +11,7 @@ import torch
 from planar import planar
 from turning import turning
 
-from torch_ekm.enhanced.hand_figures import HandFigures
+from torch_ekm.estimation.hand_figures import HandFigures
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import ContactMode, ContactMotion, KinematicModel
 from torch_ekm.model.moving_contacts import contact_laws, contact_motion

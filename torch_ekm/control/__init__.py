@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from ..enhanced.hand_figures import DescribedFigures, HandFigures
+from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.hand_figures import DescribedFigures, HandFigures
 from .bands import Band, Bands
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Decision, Piece, StopReason
 from .focus import Direction, FocusedPose, PoseTarget
-from .force_sensitivity import ForceSensitivity
 from .journal import Journal
 from .knowledge import HandKnowledge
 from .limiting import LimitingFunction, StepBound

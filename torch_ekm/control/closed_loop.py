@@ -12,7 +12,7 @@ import torch
 
 from .._checks import check_kind
 from .._extras import require
-from ..enhanced.hand_figures import DescribedFigures, HandFigures
+from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import StateError
 from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
 from ..plant.frames_at_rest import mean_reading

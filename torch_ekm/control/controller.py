@@ -25,9 +25,9 @@ from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 
 if TYPE_CHECKING:
+    from ..estimation.force_sensitivity import ForceSensitivity
     from ..model import Linearization
     from ..model.linearization import FollowedFigures
-    from .force_sensitivity import ForceSensitivity
 
 #: What a step should do by default: effort, off-axis motion, grip force, focus. The figures suit the iCub
 #: hand.

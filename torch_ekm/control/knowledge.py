@@ -14,13 +14,13 @@ from torch import nn
 from .._files import write_whole
 from .._recorded import Recorded, check_state, describe, make
 from ..description import HandDescription
-from ..enhanced.hand_figures import DescribedFigures, HandFigures
+from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import EKMError, FileFormatError, ParameterError, StateError
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
 from ..typing import Tensor
-from .force_sensitivity import ForceSensitivity
 from .model_error import ModelError
 
 Part = Literal["servo", "forces", "figures", "error"]

@@ -13,7 +13,7 @@ from .decision import Expectation
 
 if TYPE_CHECKING:
     from ..description import HandDescription
-    from ..enhanced.hand_figures import DescribedFigures, HandFigures
+    from ..estimation.hand_figures import DescribedFigures, HandFigures
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
 

@@ -10,12 +10,12 @@ import torch
 
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
+from ..estimation.force_sensitivity import ForceSensitivity
 from ..exceptions import GraspEndsError, GraspError
 from ..kinematics import GraspState
 from ..model import ContactMotion, KinematicModel, Linearization
 from ..plant import Observation, PlantStatus
 from ..typing import Float, Tensor
-from .force_sensitivity import ForceSensitivity
 
 _NEAR_END = math.radians(0.1)
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from ..estimation.parameter_filter import ParameterFilter
 from .adaptive_model import AdaptiveModel
 from .encoding import GraspEncoding
 from .enhanced_model import EnhancedModel
 from .grasp_learner import grasp_learner
-from .parameter_filter import ParameterFilter
 from .saving import load, save
 
 __all__ = [

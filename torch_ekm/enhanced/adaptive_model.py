@@ -9,10 +9,10 @@ import torch
 from torch import nn
 
 from .._checks import check_shape
+from ..estimation.parameter_filter import FilterReport, ParameterFilter
 from ..exceptions import NoDerivativeError, ParameterError
 from ..residual.derivatives import recordable, value_and_jacobian
 from ..typing import Float, Tensor
-from .parameter_filter import FilterReport, ParameterFilter
 
 
 class AdaptiveModel(nn.Module):

@@ -116,7 +116,7 @@ class EnhancedModel(Recorded, nn.Module):
             raise ParameterError("model", model, "a KinematicModel")
         n_q, n_a = state.q.shape[-1], model.hand.n_a
         if figures is None and model.figures is None:
-            from .hand_figures import HandFigures  # the model is slow to import
+            from ..estimation.hand_figures import HandFigures  # the model is slow to import
 
             figures = HandFigures.of(model.hand)
         model = model if figures is None else model.with_figures(figures)

@@ -6,44 +6,24 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
+from .._noise import NOISE
 from ..contact import ContactSet, constraint_matrix
 from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..contact.detector import ContactDetector
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
+from ..estimation.update import update
 from ..exceptions import GraspError, NoContactError
 from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization
 from ..typing import Float, Tensor
 
-_DEG = math.pi / 180
 _ITERATIONS = 3  # of an update: gaps are not linear in the state
-# standard deviations
-_JOINT = 0.3 * _DEG  # [rad] of a measured joint angle
-_POSITION = 0.2e-3  # [m] of the object's point as the camera sees it, where the plant states no covariance
-_ROTATION = 0.15 * _DEG  # [rad] of its orientation, likewise
-_GAP = 0.05e-3  # [m] of the gap of a pad that measures a force
-# of a joint's predicted motion, as a share of the largest of an actuator: a kinematic model with tendons of
-# another radius predicts joints badly
-_JOINT_DRIFT = 0.5
-_POSE_DRIFT = 0.02  # of the object's predicted motion, as a share of it, on top of what the learner states
-_MODEL_DRIFT = 0.3  # the same of a kinematic model alone, which states nothing
-_SLIP = 0.05  # of the slide of a contact, as a share of its way
-_LEAST_FORCE = 0.3  # [N] a pad that measures less touches nothing, or is dead
-
-
-class Measurement(NamedTuple):
-    """``H ds = miss(s) +- noise``: n_m linear measurements of an increment ds [rad, m, rad] of the state."""
-
-    H: Float[Tensor, "n_m n_s"]
-    miss: Callable[[GraspState], Float[Tensor, " n_m"]]
-    """What was measured less what a state says."""
-    noise: Float[Tensor, "n_m n_m"]
-    """Covariance of the measurements, in the squares of their units."""
+Measured = tuple[Tensor, Tensor, Callable[[GraspState], Tensor]]  # H, covariance of the noise, miss
 
 
 class PoseFilter:
@@ -51,11 +31,11 @@ class PoseFilter:
 
         motion    s <- s (+) ds,  P <- P + Q         ds = (f + g)(s, w),  w what the encoders did
         rolling   A ds = 0 +- 5 % of the way         at the middle of the motion; conditions ds and Q
-        joints    q_measured = q +- 0.3 deg
-        touch     gap_i(s) = 0 +- 0.05 mm            pads i that measure a force
+        joints    q_measured = q +- 0.5 deg
+        touch     gap_i(s) = 0 +- 0.1 mm             pads i that measure a force
         camera    (o, R) as seen                     when it is asked
 
-    Q is diagonal: of joints 50 % of the largest motion of an actuator, of the pose 2 % of its motion (30 %
+    Q is diagonal: of joints 50 % of the largest motion of an actuator, of the pose 8 % of its motion (30 %
     where nothing is learned), and the variance that the learner states. Contacts that roll tie the object's
     motion to that of the fingers, so measured joints and closed gaps correct the pose, too. The update is
     iterated, since gaps are not linear (Bell and Cathey, IEEE TAC 38(2), 1993).
@@ -94,11 +74,11 @@ class PoseFilter:
         Args:
             seen: joints and pose as measured.
             fingertip_force: normal force of each pad [N]; None: the pads near the object touch it.
-            pose_covariance: of the pose's error twist [m, rad]; None or NaN: 0.2 mm and 0.15 deg.
+            pose_covariance: of the pose's error twist [m, rad]; None or NaN: 0.3 mm and 0.3 deg.
         """
         n_q = seen.q.shape[-1]
         P = seen.q.new_zeros(n_q + 6, n_q + 6)
-        P[:n_q, :n_q] = _JOINT**2 * torch.eye(n_q, dtype=P.dtype)
+        P[:n_q, :n_q] = NOISE.joint**2 * torch.eye(n_q, dtype=P.dtype)
         P[n_q:, n_q:] = self._seen_covariance(pose_covariance, P)
         self.state, self.covariance, self._last = seen, self._permitted(P), None
         self._update(None, fingertip_force)
@@ -131,28 +111,27 @@ class PoseFilter:
             kin = self.kinematic.contact_kinematics(middle, contacts)
             A, v, w = constraint_matrix(kin), *ds[-6:].split(3)
             way = torch.linalg.vector_norm(v + torch.linalg.cross(w.expand_as(kin.lever), kin.lever), dim=-1)
-            slide = (_SLIP * way + 1e-5)[[row // 6 for row in kin.rows]]
-            gain = torch.linalg.solve(A @ Q @ A.mT + torch.diag(slide.square()), A @ Q).mT
-            ds, Q = ds - gain @ (A @ ds), Q - gain @ A @ Q
+            slide = (NOISE.slip * way + 1e-5)[[row // 6 for row in kin.rows]]
+            ds, Q = map(torch.from_numpy, update(ds, Q, -A @ ds, A, slide.square()))
         self.state = self.state.plus(ds)
-        self.covariance = self.covariance + 0.5 * (Q + Q.mT)
+        self.covariance = self.covariance + Q
 
     def measure(self, q: Float[Tensor, " n_q"], fingertip_force: Float[Tensor, " n_pads"] | None) -> None:
         """What measured joints [rad] and fingertips [N] say at rest."""
         joints = torch.eye(len(q), len(self.covariance), dtype=q.dtype)
-        variance = _JOINT**2 * torch.eye(len(q), dtype=q.dtype)
-        self._update(Measurement(joints, lambda at: q - at.q, variance), fingertip_force)
+        variance = NOISE.joint**2 * torch.eye(len(q), dtype=q.dtype)
+        self._update((joints, variance, lambda at: q - at.q), fingertip_force)
 
     def look(self, seen: GraspState, pose_covariance: Float[Tensor, "6 6"] | None = None) -> None:
         """What the camera says; the joints of ``seen`` are not used. See :meth:`start`."""
         pose = torch.eye(len(self.covariance), dtype=self.covariance.dtype)[-6:]
         variance = self._seen_covariance(pose_covariance, self.covariance)
-        self._update(Measurement(pose, lambda at: seen.minus(at)[-6:], variance), None, gaps=False)
+        self._update((pose, variance, lambda at: seen.minus(at)[-6:]), None, gaps=False)
 
     def _seen_covariance(self, stated: Tensor | None, like: Tensor) -> Tensor:
         if stated is not None and bool(torch.isfinite(stated).all()):
             return stated.to(like)
-        return torch.diag(like.new_tensor([_POSITION] * 3 + [_ROTATION] * 3).square())
+        return torch.diag(like.new_tensor(NOISE.pose).square())
 
     def _linearize(self, moved: Tensor, fingertip_force: Tensor | None) -> Linearization | None:
         """The model at the state, with forces carried along from motion to motion; None: it refuses."""
@@ -172,9 +151,9 @@ class PoseFilter:
         unit = moved.new_tensor([CHARACTERISTIC_LENGTH] * 3 + [1.0] * 3)
         share, size = 1.0, largest
         if ds is not None:
-            share = _MODEL_DRIFT if self.enhanced is None else _POSE_DRIFT
+            share = NOISE.described if self.enhanced is None else NOISE.share
             size = torch.linalg.vector_norm(ds[n_q:] / unit)
-        std = torch.cat([_JOINT_DRIFT * largest.expand(n_q), share * size * unit])
+        std = torch.cat([NOISE.joint_motion * largest.expand(n_q), share * size * unit])
         return self._permitted(torch.diag(std.square() + 1e-14 + unsure))
 
     def _permitted(self, covariance: Tensor) -> Tensor:
@@ -196,33 +175,28 @@ class PoseFilter:
             pressing = contacts.gap <= self.kinematic.options.contact_margin
         else:
             pads = self.kinematic.hand.pad_indices(contacts.finger)
-            pressing = fingertip_force[pads] >= _LEAST_FORCE
+            pressing = fingertip_force[pads] >= NOISE.pressing
         rows = torch.nonzero(pressing).flatten().tolist()
         if not rows:
             raise NoContactError("no pad measures a force")
         return contacts.select(rows)
 
-    def _update(
-        self, measured: Measurement | None, fingertip_force: Tensor | None, *, gaps: bool = True
-    ) -> None:
-        """Condition on a measurement ``H ds = miss(s) +- noise``, and on the gaps of pads that press."""
+    def _update(self, measured: Measured | None, force: Tensor | None, *, gaps: bool = True) -> None:
+        """Condition on ``H ds = miss(s) +- noise``, and on the gaps of pads that press."""
         prior, P = self.state, self.covariance
-        ds, H, gain, noise = torch.zeros_like(P[0]), P[:0], P[:, :0], P[:0, :0]
+        ds = torch.zeros_like(P[0])
         for _ in range(_ITERATIONS):
             at = prior.plus(ds)
-            H, miss, noise = P[:0], P[0, :0], P[:0, :0]
+            H, noise, miss = P[:0], P[:0, :0], P[0, :0]
             if measured is not None:
-                H, miss, noise = measured.H, measured.miss(at), measured.noise
+                H, noise, miss = *measured[:2], measured[2](at)
             if gaps:
                 with contextlib.suppress(NoContactError):
-                    contacts = self._touching(at, fingertip_force)
+                    contacts = self._touching(at, force)
                     kin = self.kinematic.contact_kinematics(at, contacts)
                     closing = constraint_matrix(kin)[kin.normal_rows]  # gap(s + ds) = gap - closing ds
                     H, miss = torch.cat([H, closing]), torch.cat([miss, contacts.gap])
-                    gap = P.new_full((len(closing),), _GAP).square()
+                    gap = P.new_full((len(closing),), NOISE.gap).square()
                     noise = torch.block_diag(noise, torch.diag(gap))
-            gain = torch.linalg.solve(H @ P @ H.mT + noise, H @ P).mT
-            ds = gain @ (miss + H @ ds)
-        keep = torch.eye(len(P), dtype=P.dtype) - gain @ H
+            ds, self.covariance = map(torch.from_numpy, update(0 * ds, P, miss, H, noise, at=ds))
         self.state = prior.plus(ds)
-        self.covariance = keep @ P @ keep.mT + gain @ noise @ gain.mT

@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._noise import NOISE
 from ..description import HandDescription
+from ..estimation.update import update
 from ..exceptions import StateError
 from ..kinematics import ServoModel
 from ..plant import PlantStatus, Trajectory
@@ -17,12 +19,11 @@ from ..typing import Array
 _DEG = math.pi / 180
 BASELINE = 12  # motions before an actuator is judged
 _DRIFT, _ALARM = 1.5, 18.0  # of the sum of z^2 / 2: taken off at each motion; what is a change
-_OUTLIER = 4.0  # z of motions that nothing is learned from
 _GAVE = 5.0  # [deg] a tendon that gives more in one motion does not hold
 _WORTH = 5.0  # motions: the first guess of the noise
 _PRIORS = {  # before the first motion: figures, their standard deviations, that of the noise [rad]
-    "tendon": ((0.7,), (0.4,), 0.7 * _DEG),
-    "servo": ((0.0, 0.0), (1.5 * _DEG, 0.5 * _DEG), 0.15 * _DEG),
+    "tendon": ((0.7,), (0.4,), NOISE.tendon),
+    "servo": ((0.0, 0.0), (NOISE.dead_zone, NOISE.bias), NOISE.servo),
 }
 
 
@@ -116,11 +117,10 @@ class _Watch:
         return y - float(self.theta @ x)
 
     def learn(self, x: Array, y: float) -> None:
-        Px, error = self.P @ x, self.error(x, y)
-        spread, noise = 1 + float(x @ Px), self.squares / self.weight
-        self.theta, self.P = self.theta + Px * (error / spread), self.P - np.outer(Px, Px) / spread
-        self.weight, self.squares = self.weight + 1, self.squares + min(error**2 / spread, 9 * noise)
-        self.count += 1
+        error, spread, noise = self.error(x, y), 1 + float(x @ self.P @ x), self.squares / self.weight
+        self.theta, self.P = update(self.theta, self.P, np.array([error]), x[None], np.ones(1))
+        self.squares += min(error**2 / spread, NOISE.outlier**2 * noise)
+        self.weight, self.count = self.weight + 1, self.count + 1
 
     def see(self, at: tuple[int, int], x: Array, y: float, stood: bool, excused: float) -> None:
         """Judge a motion and learn from it; errors up to ``excused`` are none."""
@@ -134,7 +134,7 @@ class _Watch:
             before = [] if z2 / 2 - _DRIFT > _ALARM else self.misfits  # this motion alone is enough
             self.sum = max(0.0, self.sum + z2 / 2 - _DRIFT)
             self.misfits = [*before, (at, x, y)] if self.sum else []
-        if not excused and (self.count < BASELINE or z2 < _OUTLIER**2):
+        if not excused and (self.count < BASELINE or z2 < NOISE.outlier**2):
             self.learn(x, y)
 
     def against(self, new: _Watch) -> str:

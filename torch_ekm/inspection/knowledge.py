@@ -11,7 +11,7 @@ from typing import NamedTuple
 from ..control import HandKnowledge
 from ..control.knowledge import Part, previous
 from ..description import load_hand
-from ..enhanced.hand_figures import HandFigures
+from ..estimation.hand_figures import HandFigures
 from ..exceptions import EKMError
 from ..kinematics import ServoModel
 

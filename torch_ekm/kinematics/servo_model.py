@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from torch import nn
 
 from .._checks import check_finite, check_shape
+from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Bool, Float, Tensor
 
 Mask = NDArray[np.bool_]
 _DEG = math.pi / 180
-_PRIOR_STD = (1.0 * _DEG, 0.3 * _DEG)  # [rad] of d and b before the first motion
-_NOISE_STD = 0.1 * _DEG  # [rad] of a servo's error from motion to motion, a first guess worth ten motions
+_PRIOR_STD = (NOISE.dead_zone, NOISE.bias)
 _LEAST_STD = 1e-6  # [rad] of that error: no encoder is better
 _FORGETTING = 0.995  # of the least squares, for each motion
-_WEIGHTS = 10.0, 1 / (1 - _FORGETTING)  # of the noise's estimate, first and at last
+_WEIGHTS = 10.0, 1 / (1 - _FORGETTING)  # of the noise's estimate, in motions: first and at last
 
 
 class IdealServos(Recorded, nn.Module):
@@ -82,7 +82,7 @@ class ServoModel(Recorded, nn.Module):
     learns = True
     moved_from = 3 * (0.01 * _DEG)
     """Readings of an encoder up to this size are its noise, three standard deviations [rad]."""
-    resolution = 0.02 * _DEG
+    resolution = NOISE.still
     """Wanted motions up to this size are none [rad]."""
     largest = 6 * _DEG
     """No dead zone, bias or error of a motion is larger [rad]."""
@@ -90,12 +90,12 @@ class ServoModel(Recorded, nn.Module):
     def __init__(self, names: Sequence[str]) -> None:
         super().__init__()
         self.names = tuple(names)
-        self._prior = torch.diag(torch.tensor(_PRIOR_STD, dtype=torch.float64).square()) / _NOISE_STD**2
+        self._prior = torch.diag(torch.tensor(_PRIOR_STD, dtype=torch.float64).square()) / NOISE.servo**2
         n = len(self.names)
         self.estimate = nn.Buffer(torch.zeros(n, 2).double())  # theta = (d, b) [rad]
         self.covariance = nn.Buffer(self._prior.repeat(n, 1, 1))  # of theta, in units of the noise's variance
         self.weight = nn.Buffer(torch.full((n,), _WEIGHTS[0]).double())
-        self.squares = nn.Buffer(self.weight * _NOISE_STD**2)
+        self.squares = nn.Buffer(self.weight * NOISE.servo**2)
         self.before = nn.Buffer(self.estimate.clone())  # theta before the first failure in succession
         self.before_covariance = nn.Buffer(self.covariance.clone())
         self.failures = nn.Buffer(torch.zeros(n).long())  # commands in succession that moved nothing
@@ -187,7 +187,7 @@ class ServoModel(Recorded, nn.Module):
         noise = at.squares[went] / at.weight[went]
         error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
-        self._open(at, error**2 > 16 * noise * spread, went)
+        self._open(at, error**2 > NOISE.outlier**2 * noise * spread, went)
         error = v[went] - w[went] - (x * at.estimate[went]).sum(-1)
         Px, spread = _spread(at, x, went)
         at.estimate[went] += Px * (error / spread)[:, None]
@@ -196,7 +196,8 @@ class ServoModel(Recorded, nn.Module):
         small = (faded[:, [0, 1], [0, 1]] <= self._prior.diagonal().numpy()).all(-1)
         at.covariance[went] = np.where(small[:, None, None], faded, P)
         # bounded: a servo that has become another one is not a noisy one
-        square = np.clip(error**2 / spread, _LEAST_STD**2, np.minimum(16 * noise, self.largest**2))
+        most = np.minimum(NOISE.outlier**2 * noise, self.largest**2)
+        square = np.clip(error**2 / spread, _LEAST_STD**2, most)
         at.weight[went] = _FORGETTING * at.weight[went] + 1
         at.squares[went] = _FORGETTING * at.squares[went] + square
 
@@ -210,7 +211,7 @@ class ServoModel(Recorded, nn.Module):
             return ((x * at.estimate[stood]).sum(-1) - abs(v[stood])) / np.sqrt(noise * spread)
 
         Px, spread = _spread(at, x, stood)
-        self._open(at, excess(spread) < -4, stood)
+        self._open(at, excess(spread) < -NOISE.outlier, stood)
         Px, spread = _spread(at, x, stood)
         z = excess(spread)
         beyond = torch.special.log_ndtr(torch.from_numpy(z)).numpy()

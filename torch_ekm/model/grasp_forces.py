@@ -12,17 +12,13 @@ from typing import Any
 import numpy as np
 
 from .._arrays import namespace, norm
+from .._noise import NOISE
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
 from ..contact.forces.balance import ForceStatus
 from ..contact.forces.options import ForceOptions
 from ..exceptions import ShapeError
 from ..typing import AnyArray, Array, Float, Tensor
-
-_ANY_FORCE = 10.0  # [N] standard deviation of a normal force of which nothing is known
-_DRIFT_STD = 0.15  # [N] of a contact force's drift from its prediction at every motion, per axis
-_CHANGE_STD = 0.3  # the same as a share of the predicted change; both add up
-_FRICTION_STD = 0.05  # of the friction coefficients, relative
 
 
 @dataclass(frozen=True)
@@ -113,7 +109,7 @@ def margin_std(
     blocks = covariance.reshape(*covariance.shape[:-2], n_c, 4, n_c, 4)
     own = xp.moveaxis(xp.diagonal(blocks, 0, -4, -2), -1, -3)
     variance = (gradient[..., None, :] @ own @ gradient[..., None])[..., 0, 0]
-    return xp.sqrt(variance.clip(0.0) + (_FRICTION_STD * contacts.friction * normal_force) ** 2)
+    return xp.sqrt(variance.clip(0.0) + (NOISE.friction * contacts.friction * normal_force) ** 2)
 
 
 def start_covariance(
@@ -124,7 +120,8 @@ def start_covariance(
     kind = {"dtype": normal.dtype, "device": normal.device}
     along = normal[..., None] * normal[..., None, :]
     blocks = xp.zeros((*batch, n_c, 4, 4), **kind)
-    blocks[..., :3, :3] = options.start_std**2 * (xp.eye(3, **kind) - along) + _ANY_FORCE**2 * along
+    across = xp.eye(3, **kind) - along
+    blocks[..., :3, :3] = options.start_std**2 * across + NOISE.any_normal_force**2 * along
     blocks[..., 3, 3] = (options.start_std * CHARACTERISTIC_LENGTH) ** 2
     spread = blocks[..., :, :, None, :] * xp.eye(n_c, **kind)[:, None, :, None]
     return spread.reshape(*batch, 4 * n_c, 4 * n_c)
@@ -136,7 +133,7 @@ def drift(df: Float[AnyArray, "*batch n_c 3"], dspin: AnyArray) -> Float[Any, "*
     one = xp.asarray([1.0, 1.0, 1.0, CHARACTERISTIC_LENGTH], dtype=df.dtype, device=df.device)
     of_force = (df * df).sum(-1)[..., None]
     change2 = xp.concat([of_force, of_force, of_force, dspin[..., None] ** 2], -1)
-    variance = (_DRIFT_STD * one) ** 2 + _CHANGE_STD**2 * change2
+    variance = (NOISE.force_drift * one) ** 2 + NOISE.force_share**2 * change2
     return variance.reshape(*df.shape[:-2], -1)
 
 

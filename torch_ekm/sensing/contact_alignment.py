@@ -5,26 +5,22 @@ import math
 
 import torch
 
+from .._noise import NOISE
 from .._warnings import warn
 from ..contact.contact_kinematics import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
+from ..estimation.update import update
 from ..kinematics import HandKinematics
 from ..plant import Observation, Plant, PlantWrapper
 from ..typing import Float, Tensor
-from .joint_estimator import ARM_STD, ENCODER_STD
 
-_SENSED_STD = math.radians(0.5)  # of a joint with a Hall sensor, where the plant states no covariance
-_UNSENSED_STD = math.radians(10.0)  # of the others: behind a tendon that stretches
-_GAP_STD = 1e-4  # [m]: what the object's pose and both shapes leave open
 _LASTING_STD = math.radians(5.0)  # a joint that is less certain is known by a cable alone; its error lasts
 _CHANGE = 0.2  # share of its deviation by which such an error changes between two observations
-_LEAST_FORCE = 0.5  # [N]: a pad that measures less says nothing
 _GATE = 3.0  # deviations of a gap, up to which a pad of a hand without fingertip sensors is in contact
 _ITERATIONS = 4
 _OPEN, _FAR = 7e-4, 1e-2  # [m]: gaps of a pad that measures force at which a joint's sensor may be wrong
 _ALIKE = 3.0  # nats: such joints are not distinguishable
-_WRONG_STD = math.radians(30.0)  # of a joint whose sensor is wrong
 
 
 class ContactAligned(PlantWrapper):
@@ -60,10 +56,10 @@ class ContactAligned(PlantWrapper):
         self.hand = hand
         self._detector = ContactDetector(hand, obj, margin=math.inf)
         self._kinematics = HandKinematics(hand)
-        self._range = tuple(torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
+        self._range = hand.joint_lower, hand.joint_upper
         sensed = {sensor.joint for sensor in hand.hall_sensors}
-        std = [_SENSED_STD if name in sensed else _UNSENSED_STD for name in hand.joint_names]
-        moves = self._range[1] > self._range[0]
+        std = [NOISE.joint if name in sensed else NOISE.unsensed_joint for name in hand.joint_names]
+        moves = torch.from_numpy(hand.joint_upper > hand.joint_lower)
         self._last: tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"]] | None = None
         """What each joint took at the last observation [rad], and the variance that is left [rad^2]."""
         self._covariance = torch.diag(torch.tensor(std, dtype=torch.float64) ** 2 * moves)
@@ -101,14 +97,13 @@ class ContactAligned(PlantWrapper):
         self, seen: Observation, expected: Float[Tensor, " n_q"], P: Float[Tensor, "n_q n_q"], pads: list[str]
     ) -> tuple[Float[Tensor, " n_q"], Float[Tensor, " n_q"], Float[Tensor, " n"]]:
         """Joints, the variance that the gaps leave them [rad^2], and the gaps that stay [m]."""
-        R = _GAP_STD**2 * torch.eye(len(pads), dtype=P.dtype)
-        q, left, gap = expected, P.diagonal(), P.new_zeros(0)
+        q, left, gap = expected, P, P.new_zeros(0)
         for _ in range(_ITERATIONS if pads else 0):
             before, (gap, H) = q, self._gaps(seen, q, pads)
-            gain = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
-            q = (expected - gain @ (gap + H @ (expected - q))).clamp(*self._range)
-            left, gap = (P - gain @ H @ P).diagonal(), gap + H @ (q - before)
-        return q, left, gap
+            R = gap.new_full(gap.shape, NOISE.gap**2)
+            q, left = map(torch.from_numpy, update(expected, P, -gap, H, R, at=q, bounds=self._range))
+            gap = gap + H @ (q - before)
+        return q, left.diagonal(), gap
 
     def _doubted(
         self,
@@ -123,7 +118,7 @@ class ContactAligned(PlantWrapper):
         J_a = torch.from_numpy(self.hand.actuation_jacobian)
         way = seen.a - torch.from_numpy(self.hand.actuator_offset)
         differs, M = torch.cat([-at, way - J_a @ expected]), torch.cat([H, J_a])
-        R = torch.cat([torch.full_like(at, _GAP_STD**2), ENCODER_STD**2 + (ARM_STD * way) ** 2])
+        R = torch.cat([torch.full_like(at, NOISE.gap**2), NOISE.encoder**2 + (NOISE.arm * way) ** 2])
         for pad in ((gap.abs() > _OPEN) & (at.abs() < _FAR)).nonzero().flatten().tolist():
             likely: dict[int, float] = {}
             for joint in (H[pad] * (P.diagonal() < _LASTING_STD**2)).nonzero().flatten().tolist():
@@ -155,10 +150,10 @@ class ContactAligned(PlantWrapper):
             return [
                 name
                 for name, f in zip(names, seen.fingertip_force.tolist(), strict=True)
-                if f >= _LEAST_FORCE
+                if f >= NOISE.pressing
             ]
         gap, H = self._gaps(seen, q, names)
-        std = ((H @ P * H).sum(-1) + _GAP_STD**2).sqrt()
+        std = ((H @ P * H).sum(-1) + NOISE.gap**2).sqrt()
         return [name for name, near in zip(names, (gap.abs() < _GATE * std).tolist(), strict=True) if near]
 
     def _gaps(
@@ -176,5 +171,5 @@ class ContactAligned(PlantWrapper):
 def _without_sensors(P: Float[Tensor, "n_q n_q"], joints: set[int]) -> Float[Tensor, "n_q n_q"]:
     """P with some joints known to 30 deg only."""
     wrong = P.new_zeros(len(P))
-    wrong[list(joints)] = _WRONG_STD**2
+    wrong[list(joints)] = NOISE.wrong_joint**2
     return P + torch.diag(wrong)

@@ -5,16 +5,13 @@ from typing import NamedTuple
 import torch
 
 from .._checks import check_finite
+from .._noise import NOISE
 from ..description import HandDescription
 from ..exceptions import JointMismatchError, ShapeError
 from ..typing import Float, Tensor
 from .hall.calibration import HallCalibration
 
-# s_a, by how much an encoder and J_a q + a_0 differ [rad]: at the motors of a loaded hand, behind cables that
-# stretch by degrees in a pinch of 5 N; encoders at the joints are good to half a degree
-ENCODER_STD = 0.0436
-ARM_STD = 0.3  # and by this share of the encoder's way, where moment arms are not as described
-COUPLING_STD = 5e-4  # s_c, play of a rigid coupling [rad]
+ENCODER_STD, ARM_STD, COUPLING_STD = NOISE.encoder, NOISE.arm, NOISE.coupling  # s_a, and a share; s_c
 
 
 class JointEstimate(NamedTuple):

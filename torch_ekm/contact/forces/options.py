@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from ..._checks import check_positive
+from ..._noise import NOISE
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,7 @@ class ForceOptions:
 
     torque_std: float = 0.01
     """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
-    normal_std: float = 0.3
+    normal_std: float = NOISE.force
     """Standard deviation of a measured normal force [N]."""
     start_std: float = 1.5
     """Standard deviation of a contact force of which nothing is known yet, per axis [N]."""

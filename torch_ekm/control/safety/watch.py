@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _STILL = 0.05 * _DEG  # an encoder that moves less stands
 _UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
+_WEAK = 0.75  # of what it should bear, that a finger lacks with which nothing is turned
 _ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
 
@@ -238,7 +239,7 @@ class Watch:
         return ", ".join(
             f"finger '{lin.contacts.finger[i]}' bears {force:.1f} N of {least:.1f} N"
             for i, force, least in bears
-            if force < least
+            if force < _WEAK * least
         )
 
     def rest(self, before: Observation, seen: Observation) -> Observation:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from ..._noise import NOISE
 from ...description.hand import HandDescription
 from ...exceptions import ParameterError, UnknownNameError
 from ...typing import Array, Float, Tensor
@@ -18,7 +19,7 @@ from ...typing import Array, Float, Tensor
 PRIORS = {
     "springs": 0.5,
     "rest": math.radians(10),
-    "moment_arms": 0.3,
+    "moment_arms": NOISE.arm,
     "stiffness": 0.7,
     "offset": math.radians(5),
     "backlash": math.radians(1),
@@ -33,7 +34,6 @@ _WORDS = {
     "offset": "offset",
     "backlash": "backlash",
 }
-_FURTHEST = 5.0  # priors: bounds of the search
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Parameter:
     @property
     def lowest(self) -> float:
         """Bound of x: play is not negative."""
-        return max(-_FURTHEST, -self.nominal / self.prior) if self.kind == "backlash" else -_FURTHEST
+        return -min(NOISE.furthest, self.nominal / self.prior if self.kind == "backlash" else math.inf)
 
     def slope(self, value: float) -> float:
         """d value/dx: SI units of the figure per prior."""
@@ -140,7 +140,7 @@ class Unknowns:
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Of x; a play that starts at 0 stands on its bound."""
-        return np.array([p.lowest for p in self.parameters]), np.full(len(self), _FURTHEST)
+        return np.array([p.lowest for p in self.parameters]), np.full(len(self), NOISE.furthest)
 
     def figures(self, x: Float[Tensor, " n"]) -> Figures:
         """All figures at x, with its graph."""

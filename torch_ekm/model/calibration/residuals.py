@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..._noise import NOISE
 from ...exceptions import GraspError
 from ...kinematics.play import Play
 from ...typing import Array, Tensor
@@ -20,10 +20,10 @@ from .motions import Rest
 from .parameters import Figures, Unknowns
 
 GROUPS = {
-    "joints": math.radians(0.3),
-    "position": 0.0002,
-    "rotation": math.radians(0.15),
-    "encoder": math.radians(0.5),
+    "joints": NOISE.joint,
+    "position": NOISE.position,
+    "rotation": NOISE.rotation,
+    "encoder": NOISE.joint,
     "equilibrium": 1.0,
 }
 """Standard deviations at the start: of a measured motion [rad], [m], [rad], of an encoder against joints and

@@ -39,7 +39,7 @@ def teach(learner: ParameterFilter, stream, noise: float = 0.05):
 
 
 def test_of_a_linear_model_it_is_bayes_rule(monkeypatch) -> None:
-    monkeypatch.setattr("torch_ekm.enhanced.parameter_filter._DRIFT", 0.0)
+    monkeypatch.setattr("torch_ekm.estimation.parameter_filter._DRIFT", 0.0)
     learner, seen = made(), list(motions(12))
     teach(learner, seen)
     phi, y = torch.cat([p for p, _ in seen]), torch.cat([y for _, y in seen])

@@ -12,6 +12,7 @@ import torch
 from torch import nn
 
 from .._checks import check_finite, check_kind, check_shape
+from .._noise import NOISE
 from .._recorded import Recorded
 from ..description import HandDescription
 from ..exceptions import GraspError, StateError
@@ -27,12 +28,7 @@ KINDS = ("springs", "moment_arms", "stiffness", "backlash")
 # of the prior, in units of those of the calibration: one lathe turns all pulleys, one cable strings them
 _COMMON, _OWN = 1.0, 0.4
 _PLAY = 0.5  # of the prior of a backlash: its width where none is described, and how sure it is
-_FURTHEST = 5.0  # priors: bounds
 _IDENTIFIED = 0.7  # of the variance of a figure of its kind without observations
-# [m], [rad], [rad]: what no figures explain of a motion of the object and of a joint; and its share of it
-_POSITION_STD, _ROTATION_STD, _JOINT_STD = 0.3e-3, math.radians(0.2), math.radians(0.5)
-_RELATIVE = 0.08
-_SAME = math.radians(0.02)  # [rad] of an encoder: it has not moved
 
 
 class Figure(NamedTuple):
@@ -139,7 +135,7 @@ class HandFigures(ParameterFilter):
         play = torch.tensor([not one.logarithmic for one in found])
         scale = torch.where(play, _PLAY, 1.0).double()
         start = [_PLAY * (not one.logarithmic and one.nominal == 0) for one in found]
-        lower, upper = [one.lowest for one in found], [_FURTHEST] * len(found)
+        lower, upper = [one.lowest for one in found], [NOISE.furthest] * len(found)
         super().__init__([one.label for one in found], start, scale[:, None] * prior * scale, lower, upper)
         self._is_play, self._unit = play.numpy(), Play(torch.full((int(play.sum()),), 2.0).double())
         self._play: PlayState | None = None  # in units of half the widths
@@ -161,7 +157,8 @@ class HandFigures(ParameterFilter):
         Raises:
             ParameterError: the hand has no springs, moment arms or stiffnesses.
         """
-        return cls(hand.name, _entries(hand))
+        found = Unknowns(hand, KINDS).parameters
+        return cls(hand.name, [(one.kind, one.name, one.index, one.nominal) for one in found])
 
     def check(self, hand: HandDescription) -> None:
         """That they are of this hand.
@@ -170,10 +167,7 @@ class HandFigures(ParameterFilter):
             StateError: another hand's, or its description has other figures.
         """
         ours = {one.label: one.nominal for one in self._entries}
-        theirs = {
-            Parameter(kind, name, index, value, 1.0).label: value
-            for kind, name, index, value in _entries(hand)
-        }
+        theirs = {one.label: one.nominal for one in Unknowns(hand, KINDS).parameters}
         other = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
         if other:
             had, has = (figures.get(other[0], "no such figure") for figures in (ours, theirs))
@@ -199,7 +193,7 @@ class HandFigures(ParameterFilter):
     def begin(self, a: Float[Tensor, " n_a"]) -> None:
         """The next motion begins at these encoders [rad]. Unless the last one ended there the play may stand
         anywhere."""
-        if self._a.shape != a.shape or float((a - self._a).abs().max()) > _SAME:
+        if self._a.shape != a.shape or float((a - self._a).abs().max()) > NOISE.still:
             anywhere = PlayState(*(end.numpy() for end in self._unit.unknown()))
             self._play = anywhere if len(self.width) else None
 
@@ -220,7 +214,7 @@ class HandFigures(ParameterFilter):
         motors = pull.double().numpy().copy()
         wanted = motors[self._at[-1]]
         lost = 0.5 * self._factors[self._is_play] * (self._play.position + np.sign(wanted))
-        motors[self._at[-1]] += lost * (abs(wanted) > _SAME)
+        motors[self._at[-1]] += lost * (abs(wanted) > NOISE.still)
         return torch.from_numpy(motors)
 
     def _pull(self, moved: Tensor) -> tuple[Tensor, Array, PlayState | None]:
@@ -412,10 +406,6 @@ class HandFigures(ParameterFilter):
         return "\n".join(lines)
 
 
-def _entries(hand: HandDescription) -> list[tuple[str, str, tuple[int, ...], float]]:
-    return [(one.kind, one.name, one.index, one.nominal) for one in Unknowns(hand, KINDS).parameters]
-
-
 def _digest(figures: Mapping[str, float]) -> str:
     return hashlib.sha256(repr(sorted(figures.items())).encode()).hexdigest()[:8]
 
@@ -424,7 +414,7 @@ def _noise(predicted: Array, n_joints: int, lever: float) -> Any:
     """R: sensors, and a share of the motion."""
     dq, twist = predicted[:n_joints], predicted[n_joints:]
     unit = np.array([lever] * 3 + [1.0] * 3)
-    std = np.array([_POSITION_STD] * 3 + [_ROTATION_STD] * 3)
-    size = _RELATIVE * np.linalg.norm(twist / unit)
-    of_joints = _JOINT_STD**2 + (_RELATIVE * np.linalg.norm(dq)) ** 2
+    std = np.array(NOISE.pose)
+    size = NOISE.share * np.linalg.norm(twist / unit)
+    of_joints = NOISE.joint**2 + (NOISE.share * np.linalg.norm(dq)) ** 2
     return np.concatenate([np.full(n_joints, of_joints), std**2 + (size * unit) ** 2])

@@ -10,17 +10,17 @@ import torch
 from torch import nn
 
 from .._checks import check_finite, check_shape
+from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
+from .update import update
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
-_FURTHEST = 5.0  # priors: bounds of theta
-_NOISE_STD, _LARGEST_STD = 0.25, 20.0  # [N] of a change of force that c and B do not explain
+_LARGEST_STD = 20.0  # [N] of a change of force that c and B do not explain
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 _KEPT, _TAKEN = 0.5, 0.3  # of the drift before, of the last motion
-_CLIP = 4.0  # standard deviations; a contact that slips says nothing of the rest
 
 
 class ForceSensitivity(Recorded, nn.Module):
@@ -28,10 +28,10 @@ class ForceSensitivity(Recorded, nn.Module):
 
         u = [S w; 20 w],  theta = [c - 1; B / 20]        prior N(0, I)
         r = (f_n+ - f_n) - S w - theta u                 of each pad that measures
-        D <- D - (1 - .97) D u u' D / (u' D u) + u u'    motions, forgotten in the direction of a new one
-        theta <- theta + P u r / s^2,  P = (D / s^2 + I)^-1
+        D <- D - (1 - .97) D u u' D / (u' D u)           motions, forgotten in the direction of a new one
+        theta <- update(theta, (D / s^2 + I)^-1, r, u', s^2),  D <- D + u u'
         d <- .5 d + .3 r                                 what motions in succession leave alike
-        s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .25^2)      what is left: a pad that rubs teaches less
+        s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .3^2)       what is left: a pad that rubs teaches less
 
     c of each pad scales what the model says: a hand that gives more than it is described to presses less. B
     ``(n_pads, n_a)`` says the rest. Both belong to the hand: they are kept from grasp to grasp. The drift d
@@ -49,7 +49,7 @@ class ForceSensitivity(Recorded, nn.Module):
         self.theta = nn.Buffer(torch.zeros(n_pads, 1 + n_a, dtype=torch.float64))
         self.evidence = nn.Buffer(torch.zeros(n_pads, 1 + n_a, 1 + n_a, dtype=torch.float64))
         """D, of the motions that each pad measured."""
-        self.variance = nn.Buffer(torch.full((n_pads,), _NOISE_STD**2, dtype=torch.float64))
+        self.variance = nn.Buffer(torch.full((n_pads,), NOISE.force**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
         self.drift = nn.Buffer(torch.zeros(n_pads, dtype=torch.float64))
         """d, by which a pad's force changes more than predicted, motion by motion [N]."""
@@ -62,8 +62,8 @@ class ForceSensitivity(Recorded, nn.Module):
     @property
     def scale_std(self) -> Float[Tensor, " n_pads"]:
         """Standard error of c."""
-        information = self.evidence / self.variance[:, None, None] + torch.eye(self.theta.shape[-1]).double()
-        return torch.linalg.inv(information)[:, 0, 0].sqrt()
+        P = _covariance(self.evidence.numpy(), self.variance.numpy())
+        return torch.from_numpy(P[:, 0, 0]).sqrt()
 
     @property
     def correction(self) -> Float[Tensor, "n_pads n_a"]:
@@ -92,7 +92,7 @@ class ForceSensitivity(Recorded, nn.Module):
         along = np.tile(_PRIOR_STD * moved.numpy(), (len(self.theta), 1))
         u = np.concatenate([said.numpy()[:, None], along], axis=-1)
         variance = self.variance.numpy()
-        doubt = (_gain(self.evidence.numpy(), variance, u) * u).sum(-1)
+        doubt = ((_covariance(self.evidence.numpy(), variance) @ u[..., None])[..., 0] * u).sum(-1)
         return torch.from_numpy(np.sqrt(variance + doubt))
 
     def begin(self) -> None:
@@ -135,18 +135,19 @@ class ForceSensitivity(Recorded, nn.Module):
         known = ~np.isnan(r)
         if not known.any() or not w.any():
             return torch.from_numpy(r)
-        doubt = (_gain(D, variance, u) * u).sum(-1)  # u' P u
+        doubt = ((_covariance(D, variance) @ u[..., None])[..., 0] * u).sum(-1)  # u' P u
         spread = np.sqrt(variance + doubt)
         Du = (D @ u[..., None])[..., 0]
         seen = np.maximum((Du * u).sum(-1), np.finfo(float).tiny)[:, None, None]
-        forgotten = (1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen
-        D[known] += (u[:, :, None] * u[:, None, :] - forgotten)[known]
-        bounded = np.clip(r, -_CLIP * spread, _CLIP * spread)
+        D[known] -= ((1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen)[known]
+        most = NOISE.outlier * spread  # a contact that slips says nothing of the rest
+        bounded = np.clip(r, -most, most)
         drift[known] = (_KEPT * drift + _TAKEN * bounded)[known]
-        gain = _gain(D, variance, u) / variance[:, None]
-        theta[known] += bounded[known, None] * gain[known]
-        np.clip(theta, -_FURTHEST, _FURTHEST, out=theta)
-        unexplained = np.clip(bounded**2 - doubt, _NOISE_STD**2, _LARGEST_STD**2)
+        one = bounded[:, None], u[:, None, :], variance[:, None]
+        after, _ = update(theta, _covariance(D, variance), *one, bounds=(-NOISE.furthest, NOISE.furthest))
+        theta[known] = after[known]
+        D[known] += (u[:, :, None] * u[:, None, :])[known]
+        unexplained = np.clip(bounded**2 - doubt, NOISE.force**2, _LARGEST_STD**2)
         variance[known] += _RECENT * (unexplained - variance)[known]
         return torch.from_numpy(r)
 
@@ -154,8 +155,8 @@ class ForceSensitivity(Recorded, nn.Module):
         """What is wrong with the entries of a state that is to be loaded."""
         wrong = bound_problems(
             state,
-            theta=(-_FURTHEST, _FURTHEST),
-            variance=(_NOISE_STD**2, _LARGEST_STD**2),
+            theta=(-NOISE.furthest, NOISE.furthest),
+            variance=(0.5 * NOISE.force**2, _LARGEST_STD**2),  # files of a smaller noise hold
             evidence=(-_MOST_EVIDENCE, _MOST_EVIDENCE),
         )
         if wrong:
@@ -170,7 +171,6 @@ class ForceSensitivity(Recorded, nn.Module):
         return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"
 
 
-def _gain(D: Array, variance: Array, u: Array) -> Any:
-    """``P u`` of each pad."""
-    information = D / variance[:, None, None] + np.eye(u.shape[-1])
-    return np.linalg.solve(information, u[..., None])[..., 0]
+def _covariance(D: Array, variance: Array) -> Any:
+    """P of each pad."""
+    return np.linalg.inv(D / variance[:, None, None] + np.eye(D.shape[-1]))

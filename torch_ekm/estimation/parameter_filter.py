@@ -13,6 +13,7 @@ from .._checks import check_finite, check_shape
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
+from .update import surprise, update
 
 _DRIFT = 1e-3  # q: share of the prior that comes back with each motion
 _SURPRISE = 3.0  # times what is usual, from which a motion counts less, and speaks for a change
@@ -37,10 +38,8 @@ class ParameterFilter(Recorded, nn.Module):
     """``theta ~ N(m, P)``, an extended Kalman filter on ``r = ds - f(s, da; m)``, ``phi = df/dtheta``::
 
         m <- m_0 + sqrt(1 - q) (m - m_0),  P <- (1 - q) P + q P_0          q = 1e-3
-        S = phi P phi' + R / w,  K = P phi' S^-1       w = min(1, 3 max(1, u) / z)
-        z = r' S^-1 r / n_r at w = 1,  u: mean of the last z
-        m <- m + K r                                   within the bounds
-        P <- (I - K phi) P (I - K phi)' + K (R / w) K'
+        m, P <- update(m, P, r, phi, R / w)            w = min(1, 3 max(1, u) / z)
+        z = r' (phi P phi' + R)^-1 r / n_r,  u: mean of the last z
 
     One motion costs the same time and memory however many came before. What is not identified returns to
     the start m_0 and its covariance P_0. A motion that the present uncertainty does not explain, as where a
@@ -142,33 +141,31 @@ class ParameterFilter(Recorded, nn.Module):
         if not bool((noise > 0).all()):
             raise ParameterError("noise", noise.tolist(), "positive variances")
         figures = residual, derivative, noise, self.covariance, self.prior, self.mean, self.start
-        r, phi, R, P, P_0, m, m_0 = (value.detach().double().cpu().numpy() for value in figures)
-        lower, upper = (bound.cpu().numpy() for bound in (self.lower, self.upper))
+        *seen, P, P_0, m, m_0, lower, upper = (
+            value.detach().double().cpu().numpy() for value in (*figures, self.lower, self.upper)
+        )
         P = (1 - _DRIFT) * P + _DRIFT * P_0
-        mean = m_0 + (1 - _DRIFT) ** 0.5 * (m - m_0)
-        of_prediction = phi @ P @ phi.T
-        surprise = float(r @ np.linalg.solve(of_prediction + np.diag(R), r)) / n_r
+        z = surprise(P, *seen)
         most = _SURPRISE * max(1.0, float(self.usual))
-        self.usual += _RECENT * (min(surprise, most) - self.usual)
-        self.surprises.copy_(self.surprises + 1 if surprise > most else torch.zeros_like(self.surprises))
+        self.usual += _RECENT * (min(z, most) - self.usual)
+        self.surprises.copy_(self.surprises + 1 if z > most else torch.zeros_like(self.surprises))
         opened = int(self.surprises) >= _IN_A_ROW
         if opened:
             self.before.copy_(self.mean)
             self.before_covariance.copy_(self.covariance)
             self.changed_at.copy_(self.count)
             self.surprises.zero_()
-            P, of_prediction = P_0, phi @ P_0 @ phi.T
-        weight = min(1.0, most / surprise) if surprise > 0 else 1.0
-        K = np.linalg.solve(of_prediction + np.diag(R / weight), phi @ P).T
-        wanted = mean + K @ (r + phi @ (m - mean))
+            P = P_0
+        weight = min(1.0, most / z) if z > 0 else 1.0
+        r, phi, R = seen
+        faded = m_0 + (1 - _DRIFT) ** 0.5 * (m - m_0)
+        wanted, P = update(faded, P, r, phi, R / weight, at=m)
         mean = np.clip(wanted, lower, upper)
-        left = np.eye(n) - K @ phi
-        P = left @ P @ left.T + (K * (R / weight)) @ K.T
         self.mean.copy_(torch.from_numpy(mean))
-        self.covariance.copy_(torch.from_numpy(0.5 * (P + P.T)))
+        self.covariance.copy_(torch.from_numpy(P))
         self.count += 1
         bounded = tuple(self.names[i] for i in np.flatnonzero(wanted != mean))
-        return FilterReport(surprise, weight, opened, bounded)
+        return FilterReport(z, weight, opened, bounded)
 
     def state_problems(self, state: Mapping[str, Any]) -> list[str]:
         """What is wrong with the entries of a state that is to be loaded."""

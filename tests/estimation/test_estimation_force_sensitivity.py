@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from torch_ekm.control.force_sensitivity import ForceSensitivity
+from torch_ekm._noise import NOISE
+from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import NonFiniteError, ShapeError
 
 NAN = math.nan
@@ -49,11 +50,11 @@ def test_it_scales_what_a_stiffer_description_says_everywhere() -> None:
 
 
 def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch_ekm.control.force_sensitivity._FORGETTING", 1.0)
-    monkeypatch.setattr("torch_ekm.control.force_sensitivity._RECENT", 0.0)
+    monkeypatch.setattr("torch_ekm.estimation.force_sensitivity._FORGETTING", 1.0)
+    monkeypatch.setattr("torch_ekm.estimation.force_sensitivity._RECENT", 0.0)
     true, w = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), moves(8)
     learner = taught(true, torch.zeros_like(true), w)
-    y, s, p = w @ true[0], 0.25, 20.0
+    y, s, p = w @ true[0], NOISE.force, 20.0
     exact = torch.linalg.solve(w.mT @ w / s**2 + torch.eye(3, dtype=F64) / p**2, w.mT @ y / s**2)  # S = 0
     torch.testing.assert_close(learner.correction[0], exact)
 
@@ -92,6 +93,8 @@ def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> 
     learner.update(torch.zeros(3, dtype=F64), torch.zeros(2, dtype=F64), described)  # nothing moved
     assert all(torch.equal(value, kept[name]) for name, value in learner.state_dict().items())
     other = ForceSensitivity(2, 3)
+    of_a_file = {**kept, "variance": torch.full((2,), 0.25**2, dtype=F64)}  # of a smaller noise
+    assert not other.state_problems(of_a_file)
     other.load_state_dict(kept)
     for each in (learner, other):
         each.update(moves(1, seed=9)[0], torch.ones(2, dtype=F64), described)

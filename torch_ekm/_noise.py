@@ -1,0 +1,78 @@
+"""What sensors and models leave open: one table for all that estimates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+_DEG = math.pi / 180
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations in SI units; shares are of the motion or of the force."""
+
+    position: float = 0.3e-3
+    """Of the object's place, or of a motion of it [m]: a camera at half a metre."""
+    rotation: float = 0.3 * _DEG
+    """Of the object's orientation, or of a motion of it [rad]."""
+    joint: float = 0.5 * _DEG
+    """Of a joint with a sensor, or of a motion of it [rad]: Hall sensors after a calibration."""
+    unsensed_joint: float = 10 * _DEG
+    """Of a joint that only a cable tells of [rad]: pulleys are not as described, and cables stretch."""
+    wrong_joint: float = 30 * _DEG
+    """Of a joint whose sensor is wrong [rad]: its range."""
+    encoder: float = 0.0436
+    """By how much an encoder and ``J_a q + a_0`` differ [rad]: at the motors of a loaded hand, behind cables
+    that stretch by degrees in a pinch of 5 N. Where the stretch is known they differ as joints do."""
+    still: float = 0.02 * _DEG
+    """An encoder that moves by less has not moved, a wanted motion below it is none [rad]."""
+    servo: float = 0.1 * _DEG
+    """Of a servo's error from motion to motion [rad]."""
+    dead_zone: float = 1.0 * _DEG
+    """Of a servo's dead zone, before it has moved [rad]."""
+    bias: float = 0.3 * _DEG
+    """Of a servo's bias, before it has moved [rad]."""
+    tendon: float = 0.7 * _DEG
+    """Of the joints' answer to a motor, from motion to motion [rad]: fingers share the object's motion."""
+    coupling: float = 5e-4
+    """Play of a rigid coupling [rad]."""
+    arm: float = 0.3
+    """Share by which moment arms are not as described."""
+    gap: float = 1e-4
+    """Of the gap of a pad that presses [m]: what the object's pose and both shapes leave open."""
+    slip: float = 0.05
+    """Share of the way of a rolling contact that it slides."""
+    share: float = 0.08
+    """Of a motion, what a model leaves that learns its figures, or f + g on top of what g states. With 0.12 a
+    tendon that is replaced is no surprise."""
+    described: float = 0.3
+    """The same of a model as described, which states nothing."""
+    joint_motion: float = 0.5
+    """Of a joint's predicted motion, as a share of the largest of an actuator: a model with tendons of
+    another radius predicts joints badly."""
+    force: float = 0.3
+    """Of a measured normal force, or of a change of it that is predicted [N]."""
+    pressing: float = 0.5
+    """A pad that measures less says nothing: it does not touch, or is dead [N]."""
+    any_normal_force: float = 10.0
+    """Of a normal force that was not expected, beside others that were [N]: as much as a hand presses."""
+    force_drift: float = 0.15
+    """By which a contact force leaves its prediction in each motion, per axis [N]."""
+    force_share: float = 0.3
+    """The same as a share of the predicted change; both add up."""
+    friction: float = 0.05
+    """Of friction coefficients, relative."""
+    outlier: float = 4.0
+    """So many deviations off, an observation is none of what is estimated."""
+    furthest: float = 5.0
+    """So many deviations of its prior off, no estimate is believed: its bounds."""
+
+    @property
+    def pose(self) -> tuple[float, ...]:
+        """Of an error twist ``(v; w)`` of the object [m, rad]."""
+        return (self.position,) * 3 + (self.rotation,) * 3
+
+
+NOISE = Noise()
+"""The values that all parts use."""
