@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from ..estimation.force_sensitivity import ForceSensitivity
 from ..estimation.hand_figures import DescribedFigures, HandFigures
-from .bands import Band, Bands
+from .bands import Bands
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
-from .decision import Decision, Piece, StopReason
+from .decision import Band, Decision, Piece, StopReason
 from .focus import Direction, FocusedPose, PoseTarget
 from .journal import Journal
 from .knowledge import HandKnowledge
@@ -57,6 +57,7 @@ __all__ = [
     "OffAxisTask",
     "OneStep",
     "PathEnd",
+    "Piece",
     "Plan",
     "Planner",
     "PoseTarget",

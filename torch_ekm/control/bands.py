@@ -3,47 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from ..kinematics import GraspState
-from ..typing import Array, Float, Tensor
+from ..typing import Array
+from .decision import Band, Piece
 from .model_error import NOISE
 
 if TYPE_CHECKING:
     from ..plant import Observation
     from .controller import LookAndMoveController
-    from .decision import Piece
     from .focus import PoseTarget
     from .knowledge import HandKnowledge
 
 _DEG = math.pi / 180
 _LEVER = 0.03  # [m]: a share of a rotation counts as much as that share of this translation
 _SHARE = 0.15  # of the way that a normal force has come: what the model does not know of it
-
-
-@dataclass(frozen=True)
-class Band:
-    """Predictions at a waypoint with their standard deviations."""
-
-    off: float
-    """Rotation off the focus [rad]."""
-    off_std: float
-    twist_std: Float[Tensor, " 6"]
-    """Of the object's motion until then [m, rad], hand axes."""
-    force: Float[Tensor, " n_pads"] | None
-    """Normal forces of the pads that touched at the start [N], NaN of the others; None: not measured."""
-    force_std: Float[Tensor, " n_pads"] | None
-
-    def __str__(self) -> str:
-        text = f"{self.off / _DEG:.1f} +- {self.off_std / _DEG:.1f} deg off the axis"
-        if self.force is None or self.force_std is None:
-            return text
-        pairs = zip(self.force.tolist(), self.force_std.tolist(), strict=True)
-        return f"{text}, {', '.join(f'{f:.1f} +- {s:.1f} N' for f, s in pairs if not math.isnan(f))}"
 
 
 class Bands:
@@ -84,7 +62,8 @@ class Bands:
             _, variance = controller.enhanced.correction(piece.state, piece.action, state.n_s)
             self._g += variance[-6:].sqrt().numpy()
         cov = np.diag(self._g**2)
-        slopes = self._knowledge.figures.twist_slopes(lin, piece.action) if controller.enhanced else None
+        figures = self._knowledge.figures
+        slopes = None if controller.enhanced is None else figures.twist_slopes(lin, piece.action)
         if slopes is not None:
             self._figures = self._figures + slopes if self._figures.size else slopes
             cov += self._figures @ self._knowledge.figures.covariance.numpy() @ self._figures.T

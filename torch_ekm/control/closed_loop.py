@@ -14,11 +14,14 @@ from .._checks import check_kind
 from .._extras import require
 from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import StateError
+from ..model import Linearization
 from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
 from ..plant.frames_at_rest import mean_reading
+from ..residual import UpdateReport
 from ..residual.sparse_gp.engine.loading import load_loops
+from ..typing import Tensor
 from .controller import LookAndMoveController
-from .decision import Decision, StopReason
+from .decision import Decision, Expectation, StopReason
 from .ends import Ends, hindrances
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
@@ -31,7 +34,7 @@ from .reach import Reach, Reachability, out_of_reach, reach, reachability
 from .safety import Safety
 from .safety.on_the_way import OnTheWay
 from .safety.safety import Objection
-from .safety.watch import Watch
+from .safety.watch import Verdict, Watch
 
 _DEG = math.pi / 180
 _GRIPS = 3  # movements that only grip, before the first turn
@@ -59,7 +62,7 @@ class ClosedLoop:
 
     Args:
         plant: with a grasped object (already reset).
-        controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after every movement.
+        controller: its :class:`~torch_ekm.enhanced.EnhancedModel`, if it has one, learns after each movement.
         knowledge: of the hand, on which the loop goes on learning; None: nothing is known yet, and nothing is
             learned of the servos if the controller's model is no enhanced one.
         safety: when it looks again and stops.
@@ -271,7 +274,10 @@ class ClosedLoop:
         """Command, observe, learn; why the manipulation must end here, if it must."""
         first, stopped = self._command(seen, decision)
         began = time.perf_counter()
-        expect = lambda moved: self.controller.expect(decision.pieces, self._figures.pulled(moved))
+
+        def expect(moved: Tensor) -> Expectation:
+            return self.controller.expect(decision.pieces, self._figures.pulled(moved))
+
         verdict = watch.motion(seen, decision, self.plant.sent, first, expect, self.plant.observe)
         after, halt, expected = verdict.seen, verdict.halt, verdict.expected
         increment, moved = after.state.minus(seen.state), after.a - seen.a
@@ -308,11 +314,17 @@ class ClosedLoop:
         return after, watch.why
 
     def _learn(
-        self, seen: Observation, decision: Decision, after: Observation, moved, verdict, goes_on: bool
-    ):
+        self,
+        seen: Observation,
+        decision: Decision,
+        after: Observation,
+        moved: Tensor,
+        verdict: Verdict,
+        goes_on: bool,
+    ) -> UpdateReport | None:
         """What a movement teaches, and whether the object slides."""
         controller, knowledge, expected = self.controller, self.knowledge, verdict.expected
-        if controller.enhanced is None:
+        if controller.enhanced is None or expected is None:
             return None
         if not knowledge.servo.learns:  # then the dead zones are g's to learn
             moved = decision.delta_a
@@ -332,7 +344,7 @@ class ClosedLoop:
             learn_forces(controller.kinematic.hand, knowledge, expected, surprise)
         return learn(controller, self._figures, expected, moved, increment)
 
-    def _forces_there(self, seen: Observation, decision: Decision):
+    def _forces_there(self, seen: Observation, decision: Decision) -> tuple[Linearization, Tensor] | None:
         """The last linearization on the way, for the forces that go on from it."""
         last = decision.pieces[-1]
         if not last.linearization.forces.solved:

@@ -19,10 +19,10 @@ from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, Piece, StopReason
 from .focus import A_TARGET, FocusedPose, PoseTarget
 from .limiting import LimitingFunction, StepBound, contact_travel
-from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
+from .limits import ActuatorLimit, JointLimit, KeepsForce, Limit, NormalForceLimit
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
 from .situation import LinearizedModel, Situation
-from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
+from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task, WantsGrip
 
 if TYPE_CHECKING:
     from ..estimation.force_sensitivity import ForceSensitivity
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(), FocusTask())
 #: What a step must not do by default: limits of actuators, normal forces and joints.
 DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointLimit())
+
+DEFAULT_BOUND = StepBound()
 
 _LIST = "a list of objects with a method rows(model, seen)"
 
@@ -79,7 +81,7 @@ class LookAndMoveController:
         limits: Sequence[Limit] | None = None,
         *,
         limiting: LimitingFunction | None = None,
-        bound: StepBound | None = StepBound(),
+        bound: StepBound | None = DEFAULT_BOUND,
     ) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         check_kind(
@@ -98,8 +100,8 @@ class LookAndMoveController:
         for part in (*self.tasks, *self.limits):
             if isinstance(part, type) or not callable(getattr(part, "rows", None)):
                 raise ParameterError("tasks, limits", part, _LIST)
-        self._wanted = next((one.wanted for one in self.tasks if hasattr(one, "wanted")), None)
-        self._least = next((one.least for one in self.limits if hasattr(one, "least")), None)
+        self._wanted = next((t.wanted for t in self.tasks if isinstance(t, WantsGrip)), None)
+        self._least = next((x.least for x in self.limits if isinstance(x, KeepsForce)), None)
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
         self.previous: tuple[Linearization, Tensor] | None = None
         """The last linearization of this grasp whose forces were found, and the encoders there."""

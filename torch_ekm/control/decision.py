@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,7 +14,8 @@ from ..typing import Float, Tensor
 
 if TYPE_CHECKING:
     from ..model import Linearization
-    from .bands import Band
+
+_DEG = math.pi / 180
 
 
 class StopReason(Enum):
@@ -89,6 +91,27 @@ class Piece:
     def state(self) -> GraspState:
         """Where it begins."""
         return self.linearization.state
+
+
+@dataclass(frozen=True)
+class Band:
+    """Predictions at a waypoint with their standard deviations."""
+
+    off: float
+    """Rotation off the focus [rad]."""
+    off_std: float
+    twist_std: Float[Tensor, " 6"]
+    """Of the object's motion until then [m, rad], hand axes."""
+    force: Float[Tensor, " n_pads"] | None
+    """Normal forces of the pads that touched at the start [N], NaN of the others; None: not measured."""
+    force_std: Float[Tensor, " n_pads"] | None
+
+    def __str__(self) -> str:
+        text = f"{self.off / _DEG:.1f} +- {self.off_std / _DEG:.1f} deg off the axis"
+        if self.force is None or self.force_std is None:
+            return text
+        pairs = zip(self.force.tolist(), self.force_std.tolist(), strict=True)
+        return f"{text}, {', '.join(f'{f:.1f} +- {s:.1f} N' for f, s in pairs if not math.isnan(f))}"
 
 
 @dataclass(frozen=True)

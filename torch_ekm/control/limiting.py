@@ -63,17 +63,16 @@ def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) ->
 
 @dataclass(frozen=True)
 class StepBound:
-    """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + c)/(m - m_after)), c = creep mu f/W``: the
-    share of a step that is made.
+    """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + c)/(m - m_after)), c = creep mu f/W``.
 
-    w_off and v_off are the predicted rotation and translation off the focus; m_after the predicted friction
-    margins. A contact that slides holds no weight W across its way: the heavier the object is for its grip,
-    the less may be missing. The bound scales a step, and does not turn it: the same bounds as rows of the
-    program lose objects where friction is low.
+    phi is the share of a step that is made. w_off and v_off are the predicted rotation and translation off
+    the focus; m_after the predicted friction margins. A contact that slides holds no weight W across its way:
+    the heavier the object is for its grip, the less may be missing. The bound scales a step, and does not
+    turn it: the same bounds as rows of the program lose objects where friction is low.
 
     A step is not cut below ``least`` of the largest one: standing still turns nothing. But a grip f
-    is tightened first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it, where pads
-    measure it, there are none.
+       is tightened first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it, where pads
+       measure it, there are none.
     """
 
     off_rotation: float = 1.5 * _DEG

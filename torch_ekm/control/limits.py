@@ -25,6 +25,15 @@ class Limit(Protocol):
         ...
 
 
+@runtime_checkable
+class KeepsForce(Protocol):
+    """A limit that says what each finger should bear: a grasp that does not is weak."""
+
+    def least(self, f_n: Array, seen: Situation) -> Array:
+        """least_i of each pad in contact ``(n_c,)`` [N]."""
+        ...
+
+
 @dataclass(frozen=True)
 class ActuatorLimit:
     """``a_min <= a + u <= a_max, |u| <= step``; some actuators do not move at all.

@@ -21,7 +21,7 @@ NOISE = math.radians(0.4)  # [rad] of a motion as measured: two poses, and a pad
 class ModelError(Recorded, nn.Module):
     """``s_i^2 <- s_i^2 + c (clip((e_i^2 - n^2) / way^2, 0, 1) - s_i^2), c = min(1, (way/2.5 deg)^2) / 4``.
 
-    e is the rotation of the object that a model of ``f + g`` did not predict: along its way, and square to it.
+    e is the rotation of the object that a model of ``f + g`` did not predict: along its way, and across.
     n = 0.4 deg is the part that has nothing to do with the way. Two figures for a hand and what it holds: for
     slides, figures that are not known, terms that the model leaves out. Variances of figures and of g are
     added where they are known.

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 _DEG = math.pi / 180
 _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
+_GRIP = 3  # pieces of a movement that grips: pads that read wrong are seen after it
 _CLOSE = 0.3 * _DEG  # [rad] from which one is enough
 
 
@@ -180,14 +181,15 @@ class WholeTurn:
 
     def _against(self, band: Band, first: bool) -> str:
         """Why a waypoint is not safe; empty: it is."""
-        k = self.deviations
-        most = self.off_rotation + (self.margin if first else 0.0)
-        if band.off + k * band.off_std > most:
-            return f"the object may turn {(band.off + k * band.off_std) / _DEG:.1f} deg off the axis"
-        if first or band.force is None or band.force_std is None:
-            return ""
-        low = (band.force - k * band.force_std).nan_to_num(nan=math.inf)
+        off = self._off(band, self.off_rotation + (self.margin if first else 0.0))
+        if off or first or band.force is None or band.force_std is None:
+            return off
+        low = (band.force - self.deviations * band.force_std).nan_to_num(nan=math.inf)
         return f"a finger may keep only {float(low.min()):.1f} N" if bool((low < self.force).any()) else ""
+
+    def _off(self, band: Band, most: float) -> str:
+        off = band.off + self.deviations * band.off_std
+        return f"the object may turn {off / _DEG:.1f} deg off the axis" if off > most else ""
 
     def _grip(
         self, controller: LookAndMoveController, seen: Observation, knowledge: HandKnowledge, firm: float
@@ -204,7 +206,7 @@ class WholeTurn:
             if not waypoints and not _loose(rehearsal.first, firm):
                 return None
             waypoint = Waypoint(piece, state, bands.add(piece, state))
-            if waypoints and self._against(waypoint.band, first=False):
+            if len(waypoints) == _GRIP or self._off(waypoint.band, self.off_rotation):
                 break
             waypoints.append(waypoint)
         if not waypoints:

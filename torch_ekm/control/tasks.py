@@ -29,6 +29,15 @@ class Task(Protocol):
         ...
 
 
+@runtime_checkable
+class WantsGrip(Protocol):
+    """A task that says how hard the object is to be gripped."""
+
+    def wanted(self, kinematic: Linearization, seen: Situation) -> float:
+        """Normal force of the finger that opposes the others [N]."""
+        ...
+
+
 @dataclass(frozen=True)
 class FocusTask:
     """``D M_c E_p (f + g)(s, u) + sl = D dx_d``: the step meets the limited error if it can, else comes as

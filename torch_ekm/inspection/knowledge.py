@@ -102,4 +102,6 @@ def _figures(knowledge: HandKnowledge) -> Iterator[Belief]:
 
 
 def _error(knowledge: HandKnowledge) -> Iterator[Belief]:
-    yield Belief("error", "of the model", "share of a motion", knowledge.error.share, None, None, "")
+    error = knowledge.error
+    for name, share in (("along", error.along), ("across", error.across)):
+        yield Belief("error", name, "share of a motion", share, None, None, "")
