@@ -14,6 +14,7 @@ from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import PRESETS, PlantParameters, SimulatedHand, preset
 from torch_ekm.simulation.mechanism.servo import Servo
+from torch_ekm.simulation.sensors import TimedState
 from torch_ekm.typing import Array
 
 #: Figures of a hand for training, each uniform between the presets "none" and "hostile".
@@ -44,12 +45,22 @@ class ModelRig:
         force = torch.zeros(len(self._model.hand.pads), dtype=torch.float64)
         force[self._model.hand.pad_indices(plan.pads)] = torch.from_numpy(along)
         self.servo.place(plan.motor)
+        self._waited = 0.0
         self._moves = ModelHand(self._model, state, torch.tensor(plan.motor), force)
 
-    def move(self, goal: Array) -> None:
-        """The tendons follow the motors, but for the play."""
-        before = self.servo.output
-        self._moves.command(torch.from_numpy(self.servo.move_to(goal) - before))
+    def follow(self, goals: Array, times: Array, frame: Any = None) -> None:
+        """The tendons follow the motors, but for the play; nothing is seen on the way."""
+        for goal in goals:
+            before = self.servo.output
+            self._moves.command(torch.from_numpy(self.servo.move_to(goal) - before))
+
+    def wait_for_frame(self) -> None:
+        """A hand without dynamics stands."""
+        self._waited += 1 / self._parameters.frame_rate
+
+    @property
+    def state(self) -> TimedState:
+        return TimedState(self.time, self.q, *self.object_pose)
 
     def actuator_torque(self, q: Array, output: Array) -> Array:
         """Of no interest here."""
@@ -74,7 +85,7 @@ class ModelRig:
 
     @property
     def time(self) -> float:
-        return 0.3 * self._moves.time
+        return 0.3 * self._moves.time + self._waited
 
 
 class ModelBench(Bench):

@@ -239,7 +239,7 @@ def test_what_is_far_is_tried_on_the_model_first(tin) -> None:
     b = b - a * (a @ b)
     chosen = LookAndMoveController(EnhancedModel.for_grasp(model, start), FocusedPose([Direction(b, "mm")]))
     loop = ClosedLoop(plant, chosen, learn=False)
-    far, near = (PoseTarget.moved(start, b, millimetres=distance) for distance in (15, -9))
+    far, near = (PoseTarget.moved(start, b, millimetres=distance) for distance in (15, -8))
     assert not loop.reachability(far).reason
     assert next(loop.steps(far)).after.status is PlantStatus.HELD
     loop.knowledge.figures.count.fill_(15)

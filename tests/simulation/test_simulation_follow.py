@@ -135,6 +135,14 @@ def test_after_the_rest_the_object_stands(engine: str, size: float) -> None:
         assert after.time - before.time < 0.02 + (size + 2) / 100 + 0.8 + 1e-6
 
 
+def test_without_noise_it_waits_until_the_object_stands() -> None:
+    """A soft hand, 10 deg: 1 deg is left when the motors stand."""
+    plant = hand("none")
+    after = plant.command(10 * DEG * torch.tensor([1.0, -1.0], dtype=torch.float64))
+    plant.wait(1.0)
+    assert float(motion(after, plant.observe())[1].norm()) < 0.05 * DEG
+
+
 def test_a_camera_that_loses_every_frame_is_waited_for_so_long_and_no_longer() -> None:
     plant = hand("nominal", frame_loss=1.0)
     before = plant.observe()

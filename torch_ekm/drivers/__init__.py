@@ -5,7 +5,8 @@ Tested against the genuine protocols; none was tried on hardware.
 
 from __future__ import annotations
 
-from .driver import BusReading, HandDriver
+from .bus_reading import BusReading
+from .driver import HandDriver
 from .dynamixel import DynamixelPlant
 from .emulated import EmulatedPlant
 from .opening import open_driver

@@ -18,6 +18,7 @@ from ..exceptions import BusError, CommandRefusedError, NeverAtRestError, StaleR
 from ..plant import Observation, PlantStatus, Stamps
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
+from .bus_reading import BusReading
 from .posture import Posture
 from .wiring import Channel, Wiring
 
@@ -29,25 +30,6 @@ _LOOK = 0.001  # [s] between two looks at what goes on
 _TRIES = 5  # of a motion that a watchdog stops, of readings that disagree
 _BEYOND = math.radians(15)  # a motor that reads farther outside its range is not sent anywhere
 _SLACK = 1e-6  # [rad] of a limit: sums of floats
-
-
-@dataclass(frozen=True)
-class BusReading:
-    """What a bus says, in its own units, in the order of the wiring; times of ``time.monotonic()`` [s]."""
-
-    motors: Sequence[float]
-    taken: float
-    """When the motors were read."""
-    moving: bool = False
-    """The bus reports that a motor moves; False: it does not, or does not report it."""
-    joints: Sequence[float] = ()
-    joints_taken: float = math.inf
-    fingertips: Sequence[float] = ()
-    fingertips_taken: float = math.inf
-    load: Sequence[float] = ()
-    """Current or torque of each motor, for ``Observation.info`` [unit of the bus]."""
-    oldest: str = ""
-    """Which motor's reading is the oldest, where they come one by one: for errors."""
 
 
 @dataclass

@@ -9,7 +9,8 @@ from typing import Any
 
 from ..description import HandDescription
 from ..exceptions import BusError
-from .driver import BusReading, HandDriver
+from .bus_reading import BusReading
+from .driver import HandDriver
 from .dynamixel_port import DynamixelPort
 from .servos import SERVOS, Servo
 

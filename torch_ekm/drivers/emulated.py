@@ -9,7 +9,8 @@ import numpy as np
 import torch
 
 from ..kinematics import ActuationMap
-from .driver import BusReading, HandDriver
+from .bus_reading import BusReading
+from .driver import HandDriver
 from .wiring import Wiring
 
 

@@ -14,7 +14,8 @@ import torch
 from .._extras import require
 from ..description import HandDescription
 from ..exceptions import BusError
-from .driver import BusReading, HandDriver
+from .bus_reading import BusReading
+from .driver import HandDriver
 from .gathered import Gathered, SenderClock, Value
 from .one_master import OneMaster
 from .pose import Sighting

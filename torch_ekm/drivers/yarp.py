@@ -12,7 +12,8 @@ from typing import Any
 
 from ..description import HandDescription
 from ..exceptions import BusError
-from .driver import BusReading, HandDriver
+from .bus_reading import BusReading
+from .driver import HandDriver
 from .one_master import OneMaster
 
 _TIMEOUT = 1.0  # [s]

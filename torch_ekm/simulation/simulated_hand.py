@@ -300,7 +300,7 @@ class SimulatedHand:
         rig, before = self._grasped(), None
         moved = rig.time
         while rig.time < moved + _LONGEST_REST:
-            rig.wait(rig.to_frame * self.config.time_step)
+            rig.wait_for_frame()
             frame = self._sensors.frame(rig.state, self._generator)
             if frame.time > (moved if before is None else before.time) + 1e-9:
                 if before is not None and self._sensors.agree(before, frame):

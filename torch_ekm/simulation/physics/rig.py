@@ -141,6 +141,10 @@ class Rig:
         """Steps to the camera's next frame, at least 1: it runs by the clock, whatever the hand does."""
         return self._period - round(self.time / self.config.time_step) % self._period
 
+    def wait_for_frame(self) -> None:
+        """Let time pass until the camera's next frame."""
+        self.wait(self.to_frame * self.config.time_step)
+
     @property
     def state(self) -> TimedState:
         """As it truly is now."""
