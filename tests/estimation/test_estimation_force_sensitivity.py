@@ -93,6 +93,8 @@ def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> 
     learner.update(torch.zeros(3, dtype=F64), torch.zeros(2, dtype=F64), described)  # nothing moved
     assert all(torch.equal(value, kept[name]) for name, value in learner.state_dict().items())
     other = ForceSensitivity(2, 3)
+    of_a_file = {**kept, "variance": torch.full((2,), 0.25**2, dtype=F64)}  # of a smaller noise
+    assert not other.state_problems(of_a_file)
     other.load_state_dict(kept)
     for each in (learner, other):
         each.update(moves(1, seed=9)[0], torch.ones(2, dtype=F64), described)

@@ -149,7 +149,8 @@ class HandFigures(ParameterFilter):
         Raises:
             ParameterError: the hand has no springs, moment arms or stiffnesses.
         """
-        return cls(hand.name, _entries(hand))
+        found = Unknowns(hand, KINDS).parameters
+        return cls(hand.name, [(one.kind, one.name, one.index, one.nominal) for one in found])
 
     def check(self, hand: HandDescription) -> None:
         """That they are of this hand.
@@ -158,10 +159,7 @@ class HandFigures(ParameterFilter):
             StateError: another hand's, or its description has other figures.
         """
         ours = {one.label: one.nominal for one in self._entries}
-        theirs = {
-            Parameter(kind, name, index, value, 1.0).label: value
-            for kind, name, index, value in _entries(hand)
-        }
+        theirs = {one.label: one.nominal for one in Unknowns(hand, KINDS).parameters}
         other = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
         if other:
             had, has = (figures.get(other[0], "no such figure") for figures in (ours, theirs))
@@ -362,10 +360,6 @@ class HandFigures(ParameterFilter):
             for one in self.changes
         ]
         return "\n".join(lines)
-
-
-def _entries(hand: HandDescription) -> list[tuple[str, str, tuple[int, ...], float]]:
-    return [(one.kind, one.name, one.index, one.nominal) for one in Unknowns(hand, KINDS).parameters]
 
 
 def _digest(figures: Mapping[str, float]) -> str:
