@@ -56,7 +56,7 @@ class Noise:
     pressing: float = 0.5
     """A pad that measures less says nothing: it does not touch, or is dead [N]."""
     any_normal_force: float = 10.0
-    """Of a normal force that was not expected, beside others that were [N]: as much as a hand presses."""
+    """Of a normal force of which nothing is known [N]: as much as a hand presses."""
     force_drift: float = 0.15
     """By which a contact force leaves its prediction in each motion, per axis [N]."""
     force_share: float = 0.3

@@ -37,8 +37,7 @@ def update(
     Returns:
         m and P after it.
 
-    Source: Bell and Cathey, IEEE Trans. Automatic Control 38(2), 1993 (repeated); Bucy and Joseph, Filtering
-    for Stochastic Processes (1968).
+    Source: Bell and Cathey, IEEE Trans. Automatic Control 38(2), 1993.
     """
     mean, P, residual, H, R = map(np.asarray, (mean, P, residual, H, R))
     noise = R if R.ndim == H.ndim else R[..., None] * np.eye(R.shape[-1])
