@@ -131,7 +131,7 @@ class WholeTurn:
     """Largest step of the rehearsal [rad]."""
     deviations: float = 2.0
     off_rotation: float = 8 * _DEG
-    """Off the focus [rad]."""
+    """Off the focus [rad]; where it is farther off already it may come back."""
     force: float = 0.6
     """Of a finger that touches [N]."""
     margin: float = 2 * _DEG
@@ -158,13 +158,14 @@ class WholeTurn:
             decision = self._grip(controller, seen, knowledge, firm)
             if decision is not None:
                 return Plan(target, focus, seen.state, decision)
+        most = max(self.off_rotation, focus.off_rotation(target.error(seen.state)))
         rehearsal = Rehearsal(controller, seen, target, self.piece, longest)
         bands = Bands(controller, knowledge, seen, target)
         waypoints: list[Waypoint] = []
         safe, against, nearest = 0, "", (focus.error(target, seen.state), 0)
         for piece, state in rehearsal.pieces():
             waypoints.append(Waypoint(piece, state, bands.add(piece, state)))
-            against = against or self._against(waypoints[-1].band, first=len(waypoints) == 1)
+            against = against or self._against(waypoints[-1].band, most, first=len(waypoints) == 1)
             safe += not against
             nearest = min(nearest, (focus.error(target, state), len(waypoints)))
             since = len(waypoints) - nearest[1]
@@ -179,9 +180,9 @@ class WholeTurn:
         decision = self._movement(controller, seen, target, rehearsal, waypoints[:safe], against)
         return Plan(target, focus, seen.state, decision, tuple(waypoints), safe, end, against)
 
-    def _against(self, band: Band, first: bool) -> str:
+    def _against(self, band: Band, most: float, first: bool) -> str:
         """Why a waypoint is not safe; empty: it is."""
-        off = self._off(band, self.off_rotation + (self.margin if first else 0.0))
+        off = self._off(band, most + (self.margin if first else 0.0))
         if off or first or band.force is None or band.force_std is None:
             return off
         low = (band.force - self.deviations * band.force_std).nan_to_num(nan=math.inf)
