@@ -45,6 +45,9 @@ class HandKnowledge(Recorded, nn.Module):
         figures: springs, moment arms, stiffnesses, and play of the drives.
     """
 
+    figures: HandFigures | DescribedFigures
+    error: ModelError
+
     def __init__(
         self,
         servo: ServoModel | IdealServos,
