@@ -10,7 +10,7 @@ import torch
 
 from ..estimation.hand_figures import HandFigures
 from ..kinematics import GraspState
-from ..typing import Array
+from ..typing import Array, Tensor
 from .decision import Band, Piece
 from .model_error import NOISE
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from .focus import PoseTarget
     from .knowledge import HandKnowledge
 
-_DEG = math.pi / 180
 _LEVER = 0.03  # [m]: a share of a rotation counts as much as that share of this translation
 _SHARE = 0.15  # of the way that a normal force has come: what the model does not know of it
 
