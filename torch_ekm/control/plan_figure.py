@@ -11,6 +11,7 @@ from .._extras import require
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ..model import Linearization
     from .plan import Plan
 
 _DEG = math.pi / 180
@@ -34,10 +35,12 @@ def draw(plan: Plan) -> Figure:
     ]
     for name in dict.fromkeys(name for one in left for name in one):
         _line(panels[2], [one.get(name, math.nan) for one in left], label=name)
-    for pad in range(0 if not bands or bands[0].force is None else len(bands[0].force)):
-        known = [(band.force[pad], band.force_std[pad]) for band in bands if band.force is not None]
-        if not any(math.isnan(force) for force, _ in known):
-            _line(panels[3], *zip(*known, strict=True))
+    forces = [band.force for band in bands if band.force is not None]
+    spread = [band.force_std for band in bands if band.force_std is not None]
+    for pad in range(len(forces[0]) if forces else 0):
+        force, std = ([float(one[pad]) for one in known] for known in (forces, spread))
+        if not any(map(math.isnan, force)):
+            _line(panels[3], force, std)
     for axes, label in zip(panels, _PANELS, strict=True):
         axes.set_ylabel(label)
         axes.axvspan(plan.safe + 0.5, max(len(bands), plan.safe) + 0.5, color="0.93", zorder=0)
@@ -46,6 +49,10 @@ def draw(plan: Plan) -> Figure:
     if left:
         panels[2].legend()
     return figure
+
+
+def _margins(lin: Linearization) -> dict[str, float]:
+    return dict(zip(lin.contacts.finger, lin.forces.relative_margin.tolist(), strict=True))
 
 
 def _line(axes: Any, middle: Sequence[float], std: Sequence[float] | None = None, label: str = "") -> None:
