@@ -34,8 +34,8 @@ from .safety.safety import Objection
 from .safety.watch import Watch
 
 _DEG = math.pi / 180
-_GRIPS = 3  # movements that only grip, before the first turn
-_FULL, _LEAST = 0.9, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
+_GRIPS = 2  # movements that only grip, before the first turn
+_FULL, _LEAST = 0.75, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
 
 
 class ClosedLoop:
