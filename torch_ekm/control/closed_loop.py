@@ -240,7 +240,7 @@ class ClosedLoop:
                     seen,
                     "; ".join(filter(None, (decision.message, plan.end.message))) + more,
                 )
-            weak = "" if turns or firm else watch.weak(decision, seen)
+            weak = "" if turns or not decision.turns else watch.weak(decision, seen)
             if weak:
                 return Stop(StopReason.WEAK_GRASP, seen, weak)
             halt = watch.command(decision, seen)
@@ -334,7 +334,7 @@ class ClosedLoop:
             off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
             if float(off.norm()) > _SLIPS * (2**0.5 * NOISE + _SHARE * float(way.norm())):
                 controller.tighter += _SLIP
-            if self.learn:
+            if self.learn and seen.status is PlantStatus.HELD:  # both ends were measured
                 knowledge.error.see(off, way)
         if not (verdict.teaches and goes_on and self.learn):
             return None
