@@ -173,7 +173,7 @@ class WholeTurn:
             since = len(waypoints) - nearest[1]
             if (against and not whole) or since >= _AHEAD or (since and nearest[0] < _CLOSE):
                 break
-        end = rehearsal.end
+        end = End() if nearest[0] < _CLOSE else rehearsal.end
         del waypoints[nearest[1] :]
         safe = min(safe, len(waypoints))
         if not waypoints:  # the model does not go anywhere from here: one step to first order
