@@ -31,8 +31,6 @@ from torch_ekm.control import (
     FocusedPose,
     LimitingFunction,
     LookAndMoveController,
-    Pace,
-    PaceOptions,
     PoseTarget,
 )
 from torch_ekm.description import ObjectDescription, Shape, load_hand, load_object
@@ -208,8 +206,7 @@ def record(obj: ObjectDescription, seed: int, name: str, motions: int = 25) -> l
     draw = np.random.default_rng(seed)
     degrees, step = 40.0 * draw.choice([-1.0, 1.0]), np.radians(draw.uniform(1.5, 4.0))
     focus = FocusedPose.rotation_about(plant.rotation_axis)
-    pace = Pace(PaceOptions(limiting=LimitingFunction(step=step)), adapts=False)
-    controller = LookAndMoveController(model, focus, pace=pace)
+    controller = LookAndMoveController(model, focus, limiting=LimitingFunction(step=step))
     target = PoseTarget.turned(seen.state, plant.rotation_axis, np.radians(degrees))
     done: list[Motion] = []
     slipped, still, before = 0, 0, witness.margins()

@@ -8,13 +8,14 @@ import threading
 
 import pytest
 import torch
-from fakes import FakePlant, HoldingPlant
+from fakes import FakePlant
 from obedient_plant import watched
 
 from torch_ekm.control import (
     ClosedLoop,
     HandKnowledge,
     LookAndMoveController,
+    OneStep,
     PoseTarget,
     Safety,
     StoppingRule,
@@ -91,15 +92,17 @@ def test_step_limit(held) -> None:
     assert plant.commands == 5
 
 
-def test_target_that_is_reached_already_needs_no_command(held) -> None:
-    done, plant = drive(held, angle=0.1)
+@pytest.mark.parametrize(("angle", "looks"), [(0.01, 2), (0.2, 4)])
+def test_target_that_is_reached_already_needs_no_command(held, angle, looks) -> None:
+    """One look may be noise, and more are needed near the tolerance."""
+    done, plant = drive(held, angle=angle)
     assert done.reason is Reason.REACHED
-    assert plant.commands == 1  # seen twice within the tolerance
+    assert (plant.commands, plant.looks) == (0, looks)
 
 
 @pytest.mark.parametrize("solved", [0, 1, 2])
 def test_a_program_that_no_solver_solves_gives_up_holding(held, monkeypatch, solved: int) -> None:
-    """Next to buckling a Jacobian is out of all scale: the loop goes back and ends, and raises nothing."""
+    """Next to buckling a Jacobian is out of all scale: the loop ends, and raises nothing."""
     solve, calls = ControlProblem.solve, []
 
     def no_longer(problem: ControlProblem):
@@ -110,9 +113,9 @@ def test_a_program_that_no_solver_solves_gives_up_holding(held, monkeypatch, sol
 
     monkeypatch.setattr(ControlProblem, "solve", no_longer)
     done, _ = drive(held)
-    assert done.reason is (Reason.GIVEN_UP if done.steps else Reason.UNSTABLE_GRASP)
+    assert done.reason is Reason.UNSTABLE_GRASP
     assert "no solution found" in done.stop.message
-    assert len(done.steps) % 2 == 0  # as many on the way back
+    assert len(done.steps) <= solved
 
 
 def test_lost_object_ends_the_manipulation(held) -> None:
@@ -262,7 +265,7 @@ def test_the_learner_is_seen_motions_what_the_encoders_did(held) -> None:
 
     controller = LookAndMoveController(ekm, axis)
     knowledge = HandKnowledge.of(loop.kinematic.hand, adapts=False)
-    driven = ClosedLoop(Half(seen), controller, knowledge=knowledge, safety=SAFETY)
+    driven = ClosedLoop(Half(seen), controller, knowledge=knowledge, safety=SAFETY, planner=OneStep())
     steps = driven.run(PoseTarget.turned(seen.state, axis, degrees=80)).steps
     for (da, nominal), step in zip(seen_motions, [s for s in steps if s.report is not None], strict=True):
         torch.testing.assert_close(da, step.after.a - step.before.a)
@@ -363,55 +366,3 @@ def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
     assert done.reason is Reason.STOPPED
     assert len(done.steps) <= 2
     assert loop.run(PoseTarget.turned(seen.state, axis, degrees=80)).reason is Reason.STALLED  # and again
-
-
-class Overshooting(HoldingPlant):
-    """The object turns for four motions, then comes back; motions that are undone turn it forth again.
-
-    ``slides``: it has slid, and they turn it further back.
-    """
-
-    ANGLES = (0.0, 3.0, 6.0, 8.0, 9.0, 7.0, 7.1, 6.0, 6.1, 6.0, 6.1)
-
-    def __init__(self, seen: Observation, axis: torch.Tensor, slides: bool = False) -> None:
-        super().__init__(dataclasses.replace(seen, fingertip_force=None))
-        self.axis, self.way, self.rotation, self.slides = axis, [], seen.rotation, slides
-        self.undone = 0
-
-    def move(self, delta_a: torch.Tensor) -> None:
-        super().move(delta_a)
-        undone = self.way and torch.allclose(self.way[-1], -delta_a, atol=1e-9)
-        self.way = self.way[:-1] if undone else [*self.way, delta_a]
-        self.undone += bool(undone)
-
-    @property
-    def turned(self) -> float:
-        if self.slides and self.undone:
-            return self.ANGLES[10] - self.undone
-        return self.ANGLES[min(len(self.way), 10)]
-
-    def observe(self) -> Observation:
-        return self.reading(rotation=exp(self.turned * DEG * self.axis) @ self.rotation)
-
-
-def test_a_turn_that_stalls_returns_to_its_best_state(held) -> None:
-    seen, axis, controller = held
-    plant = Overshooting(seen, axis)
-    rule = StoppingRule(max_steps=12, stall_window=5)
-    done = ClosedLoop(plant, controller, safety=Safety(rule=rule)).run(
-        PoseTarget.turned(seen.state, axis, degrees=20)
-    )
-    assert done.reason is Reason.STALLED
-    assert max(plant.ANGLES) - plant.turned < 1.0  # two tolerances
-    assert len(plant.commands) == len(done.steps) > len(plant.way)
-
-
-def test_an_object_that_slid_is_not_taken_further_off_on_the_way_back(held) -> None:
-    seen, axis, controller = held
-    plant = Overshooting(seen, axis, slides=True)
-    rule = StoppingRule(max_steps=12, stall_window=5)
-    done = ClosedLoop(plant, controller, safety=Safety(rule=rule)).run(
-        PoseTarget.turned(seen.state, axis, degrees=20)
-    )
-    assert done.reason is Reason.STALLED
-    assert plant.undone == 1  # 1 deg further off are more than two tolerances

@@ -22,12 +22,9 @@ from torch_ekm.control import (
     LookAndMoveController,
     NormalForceLimit,
     OffAxisTask,
-    Pace,
-    PaceOptions,
     PoseTarget,
     Situation,
     Squares,
-    StepBound,
     StopReason,
 )
 from torch_ekm.control.qp import build_qp
@@ -39,13 +36,6 @@ from torch_ekm.residual import SparseOnlineGP
 
 DEG = math.pi / 180
 STEP = LimitingFunction().step
-#: The model's own doubts about a step are another matter.
-WHOLE = StepBound(least=math.inf)
-
-
-def paced(limiting: LimitingFunction | None = None) -> Pace:
-    options = PaceOptions(bound=WHOLE) if limiting is None else PaceOptions(limiting, WHOLE)
-    return Pace(options, adapts=False)
 
 
 def controller(grasp, enhanced: bool = False, **parts) -> LookAndMoveController:
@@ -56,7 +46,7 @@ def controller(grasp, enhanced: bool = False, **parts) -> LookAndMoveController:
         rows = list(range(plant.hand.n_q, plant.hand.n_q + 6))
         used = EnhancedModel(model, learner, encode=lambda s: s.minus(s)[..., -6:], outputs=rows)
     axis = FocusedPose.rotation_about(plant.rotation_axis)
-    return LookAndMoveController(used, axis, **{"pace": paced(), **parts})
+    return LookAndMoveController(used, axis, **{"bound": None, **parts})
 
 
 def test_zero_error_gives_almost_no_command(grasp) -> None:
@@ -248,7 +238,7 @@ def test_no_contact_is_asked_to_travel_far(grasp) -> None:
     plant, _, seen, state = grasp
     target = PoseTarget.turned(state, plant.rotation_axis, 10 * DEG)
     limiting = LimitingFunction(contact_travel=0.4e-3)
-    decision = controller(grasp, pace=paced(limiting)).decide(state, seen.a, target, seen.fingertip_force)
+    decision = controller(grasp, limiting=limiting).decide(state, seen.a, target, seen.fingertip_force)
     lever = decision.linearization.contacts.point - state.position
     lever = lever - (lever @ plant.rotation_axis)[:, None] * plant.rotation_axis
     farthest = float(torch.linalg.vector_norm(lever, dim=-1).max())
@@ -261,10 +251,10 @@ def test_a_translation_carries_every_contact_as_far(grasp) -> None:
     focus = FocusedPose(torch.eye(6, dtype=torch.float64)[:3])
     target = PoseTarget(state.position + torch.tensor([3e-3, 4e-3, 0.0]), state.rotation)
     short = LimitingFunction(step=1.0, contact_travel=0.5e-3)
-    decision = LookAndMoveController(model, focus, pace=paced(short)).decide(state, seen.a, target)
+    decision = LookAndMoveController(model, focus, limiting=short, bound=None).decide(state, seen.a, target)
     torch.testing.assert_close(decision.desired, torch.tensor([0.3e-3, 0.4e-3, 0.0], dtype=torch.float64))
     free = LimitingFunction(gain=0.8, step=1.0, contact_travel=None)
-    decision = LookAndMoveController(model, focus, pace=paced(free)).decide(state, seen.a, target)
+    decision = LookAndMoveController(model, focus, limiting=free, bound=None).decide(state, seen.a, target)
     torch.testing.assert_close(decision.desired, 0.8 * torch.tensor([3e-3, 4e-3, 0.0], dtype=torch.float64))
 
 

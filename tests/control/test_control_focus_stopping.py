@@ -50,15 +50,14 @@ def test_bad_focus_is_refused() -> None:
         PoseTarget.turned(state(torch.Generator().manual_seed(0)), AXIS, math.nan)
 
 
-RULE = StoppingRule(tolerance=0.1, settle_steps=2, stall_window=3, stall_progress=0.05, max_steps=10)
+RULE = StoppingRule(tolerance=0.1, stall_window=3, stall_progress=0.05, max_steps=10)
 
 
 @pytest.mark.parametrize(
     ("errors", "limited", "reason"),
     [
         ([1.0], False, StopReason.RUNNING),
-        ([1.0, 0.05], False, StopReason.RUNNING),  # once could be noise
-        ([1.0, 0.05, 0.09], False, StopReason.REACHED),
+        ([1.0, 0.05], False, StopReason.RUNNING),  # looks decide on that
         ([1.0, 0.5, 0.49, 0.51, 0.5], False, StopReason.STALLED),
         ([1.0, 0.5, 0.49, 0.51, 0.5], True, StopReason.ACTUATOR_LIMITS),
         ([1.0, 0.8, 0.6, 0.4, 0.3], False, StopReason.RUNNING),

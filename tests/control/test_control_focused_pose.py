@@ -17,12 +17,10 @@ from torch_ekm.control import (
     FocusTask,
     LimitingFunction,
     LookAndMoveController,
-    Pace,
-    PaceOptions,
+    PathEnd,
     PoseTarget,
     Safety,
     Situation,
-    StepBound,
     StoppingRule,
     StopReason,
 )
@@ -31,7 +29,6 @@ from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, Unk
 from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
-from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
@@ -118,8 +115,8 @@ def test_a_rotation_about_one_axis_counts_as_it_is() -> None:
 
 
 def controller(grasp, directions, tasks=None, **limiting) -> LookAndMoveController:
-    options = PaceOptions(LimitingFunction(contact_travel=None, **limiting), StepBound(least=math.inf))
-    return LookAndMoveController(grasp[1], FocusedPose(directions), tasks, pace=Pace(options, adapts=False))
+    limits = LimitingFunction(contact_travel=None, **limiting)
+    return LookAndMoveController(grasp[1], FocusedPose(directions), tasks, limiting=limits, bound=None)
 
 
 def test_a_step_of_both_keeps_its_direction_and_is_limited_by_each(grasp) -> None:
@@ -230,8 +227,7 @@ def test_what_is_too_far_is_declined_with_the_reason(tin) -> None:
     assert "ends of their ranges" in far.reason
 
 
-def test_what_is_far_is_tried_on_the_model_first(tin) -> None:
-    """Once the hand is known: a link comes to bear, which J_m does not tell."""
+def test_how_far_a_shift_goes_a_plan_tells_and_j_m_does_not(tin) -> None:
     plant, model = tin
     start = plant.reset(3).state
     points, a = torch.as_tensor(plant.plan.points), plant.rotation_axis
@@ -241,13 +237,9 @@ def test_what_is_far_is_tried_on_the_model_first(tin) -> None:
     loop = ClosedLoop(plant, chosen, learn=False)
     far, near = (PoseTarget.moved(start, b, millimetres=distance) for distance in (15, -8))
     assert not loop.reachability(far).reason
-    assert next(loop.steps(far)).after.status is PlantStatus.HELD
-    loop.knowledge.figures.count.fill_(15)
-    plant.reset(3)
-    done = loop.run(far)
-    assert done.reason is StopReason.OUT_OF_REACH
-    assert not done.steps
-    assert "% of the way" in done.stop.message
+    told = loop.plan(far)
+    assert told.end.kind is not PathEnd.NOTHING
+    assert "the path ends" in str(told)
     assert loop.run(near).reason is StopReason.REACHED
 
 

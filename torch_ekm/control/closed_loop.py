@@ -232,7 +232,7 @@ class ClosedLoop:
             if decision.status is not StopReason.RUNNING:
                 said = "; ".join(filter(None, (decision.message, plan.end.message)))
                 return Stop(decision.status, seen, said + ends.surprise + watch.suspects(seen))
-            weak = "" if turns or firm else watch.weak(decision, seen)
+            weak = "" if turns or not decision.turns else watch.weak(decision, seen)
             if weak:
                 return Stop(StopReason.WEAK_GRASP, seen, weak)
             halt = watch.command(decision, seen)
@@ -279,7 +279,8 @@ class ClosedLoop:
                 self.plant.learn(after)
             halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
             if expected is not None and after.status is PlantStatus.HELD and self.learn:
-                self._lessons.judge(decision, expected, increment)
+                if seen.status is PlantStatus.HELD:  # both ends were measured
+                    self._lessons.judge(decision, expected, increment)
                 if verdict.teaches and halt is None:
                     report = self._lessons.learn(seen, decision, after, moved, expected)
             controller.went(seen.a, decision.pieces)

@@ -17,6 +17,7 @@ from ..residual.files import read, write
 from .closed_loop import ClosedLoop
 from .focus import PoseTarget
 from .manipulation import Manipulation, Step, Stop
+from .rehearsal import LONGEST
 
 _KIND = "turn under way"
 
@@ -102,7 +103,7 @@ class Journal:
         if here.status is PlantStatus.LOST:
             return "the object is lost: grasp it again"
         way = (here.a - last["a"]).abs()
-        i, most = int(way.argmax()), guards.increment + guards.encoder_jump
+        i, most = int(way.argmax()), max(LONGEST, guards.increment) + guards.encoder_jump
         if way[i] > most:
             return (
                 f"encoder '{hand.actuator_names[i]}' stands {math.degrees(way[i]):.1f} deg from where it was "

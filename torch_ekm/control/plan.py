@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 
@@ -86,6 +86,7 @@ class Plan:
         return "\n".join([first, *(f"  {left:5.2f} deg to go, {one.band}" for left, one in points)])
 
 
+@runtime_checkable
 class Planner(Protocol):
     """What decides how a loop moves. One of your own needs no more than this method."""
 
@@ -107,6 +108,7 @@ class Planner(Protocol):
         ...
 
 
+@dataclass(frozen=True)
 class OneStep:
     """The loop of the E-KM paper: one step of the controller after the other."""
 
@@ -184,7 +186,7 @@ class WholeTurn:
             since = len(waypoints) - nearest[1]
             if (against and not whole) or since >= _AHEAD or (since and nearest[0] < _CLOSE):
                 break
-        end = rehearsal.end
+        end = End() if nearest[0] < _CLOSE else rehearsal.end
         del waypoints[nearest[1] :]
         safe = min(safe, len(waypoints))
         if not waypoints:  # the model does not go anywhere from here: one step to first order

@@ -283,6 +283,7 @@ class HandFigures(ParameterFilter):
         check_shape("moved", moved, lin.manipulation_jacobian[0].shape, "of the motors")
         check_finite("moved", moved)
         check_shape("increment", increment, lin.manipulation_jacobian[:, 0].shape)
+        check_finite("increment", increment)
         motion = None if lin.equations is None else self.solve(lin.equations)
         if motion is None:
             return None

@@ -22,6 +22,7 @@ from .wrapper import PlantWrapper
 
 _DEG = math.pi / 180
 _ROUNDED = 1e-9  # [rad] of a limit: sums of floats
+_ASTRAY = 2 * _DEG  # [rad] that a motor may end farther from its goal than it was
 _OWNERS: dict[int, Gate] = {}  # of plants, by the identity of the innermost one
 _OWNING = threading.Lock()
 
@@ -175,6 +176,8 @@ class Gate(PlantWrapper):
                 return seen
             assert self.last is not None
             at = self.last.a
+            if float((goals[last] - at).abs().max()) > float(v.abs().max()) + _ASTRAY:
+                return seen  # it goes another way, and each command would take it farther
 
     def _in_one(self, v: Tensor, pieces: Tensor) -> bool:
         turns = (pieces.amin(0) < 0) & (pieces.amax(0) > 0)

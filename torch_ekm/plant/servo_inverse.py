@@ -100,6 +100,8 @@ class ServoInverse(PlantWrapper):
         """
         check_shape("waypoints", path.waypoints[0], (len(self.servo.names),), "for each waypoint")
         v, last = self._inverse(path.waypoints, start)
+        if not bool(v.isfinite().all()):
+            self.gate.command(v[~v.isfinite().all(1)][0], start, by)  # refuses, and says why
         seconds = v.diff(dim=0, prepend=torch.zeros_like(v[:1])).abs().amax(1) / self.gate.speed
         sent = Path(v, torch.maximum(path.durations, seconds).cumsum(0))
         onward = last * path.waypoints[-1] > self.servo.resolution  # else it ends on its way back

@@ -1,0 +1,167 @@
+"""A turn as one movement: its path on the model, and how far along it is safe."""
+
+from __future__ import annotations
+
+import copy
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from obedient_plant import Obedient
+
+from torch_ekm.control import (
+    ClosedLoop,
+    GripForceTask,
+    HandKnowledge,
+    LookAndMoveController,
+    ModelHand,
+    NormalForceLimit,
+    PathEnd,
+    PoseTarget,
+    Situation,
+    StopReason,
+    WholeTurn,
+)
+from torch_ekm.control.situation import LinearizedModel
+from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.exceptions import StateError
+from torch_ekm.model import KinematicModel
+from torch_ekm.simulation import SimulatedHand
+
+DEG = math.pi / 180
+
+
+@pytest.fixture(scope="module")
+def loop(held) -> ClosedLoop:
+    """With an E-KM of which nothing is known."""
+    seen, axis, model = held
+    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+    return ClosedLoop(Obedient(model, seen), controller)
+
+
+@pytest.fixture(scope="module")
+def target(held) -> PoseTarget:
+    return PoseTarget.turned(held[0].state, held[1], degrees=15)
+
+
+def test_a_path_is_that_of_the_model_hand(held, loop, target) -> None:
+    seen = loop.plant.observe()
+    controller = loop.controller
+    plan = WholeTurn().plan(controller, seen, target, loop.knowledge, 0.0, whole=True)
+    hand = ModelHand(controller.enhanced, seen.state, seen.a, seen.fingertip_force, controller.forces)
+    for one, before in zip(plan.waypoints, plan.states, strict=False):
+        there = hand.command(one.piece.action)
+        assert torch.equal(there.rotation, one.state.rotation)
+        assert torch.equal(one.piece.state.q, before.q)
+        torch.testing.assert_close(one.state.minus(before), one.piece.increment, rtol=0, atol=1e-9)
+    assert all(after < before for before, after in pairwise(plan.errors))
+    assert plan.errors[0] == pytest.approx(15 * DEG, abs=0.3 * DEG)
+    assert plan.end.kind is PathEnd.NOTHING
+    assert plan.errors[-1] < 0.3 * DEG
+    lines = str(plan).splitlines()
+    assert len(lines) == 1 + len(plan.waypoints)
+    assert f"{plan.safe} of {len(plan.waypoints)} waypoints are safe" in lines[0]
+    assert "deg to go" in lines[-1]
+    assert "off the axis" in lines[-1]
+
+
+def test_a_plan_changes_nothing(loop, target) -> None:
+    known, controller = loop.learned.state(), loop.controller
+    before = copy.copy(vars(controller)), copy.copy(vars(loop.knowledge.figures))
+    given = list(loop.plant.plant.plant.given)
+    assert loop.plan(target).waypoints
+    assert loop.reach(limit=5 * DEG).plan.waypoints
+    for name, part in loop.learned.state().items():
+        assert all(
+            torch.equal(x, known[name][entry]) for entry, x in part.items() if isinstance(x, torch.Tensor)
+        )
+    for was, now in zip(before, (vars(controller), vars(loop.knowledge.figures)), strict=True):
+        assert all(now[name] is value for name, value in was.items() if name != "_solved")
+    assert loop.plant.plant.plant.given == given
+
+
+def test_a_hand_of_which_nothing_is_known_goes_piece_by_piece(loop, target) -> None:
+    plan = loop.plan(target)
+    assert 1 <= plan.safe <= 3 < len(plan.waypoints)
+    assert plan.against
+    short = WholeTurn().plan(loop.controller, loop.plant.observe(), target, loop.knowledge, 0.0)
+    pieces = short.decision.pieces
+    assert len(pieces) == short.safe
+    torch.testing.assert_close(short.decision.delta_a, torch.stack([one.action for one in pieces]).sum(0))
+    torch.testing.assert_close(
+        short.decision.predicted, short.states[short.safe].minus(short.start), rtol=0, atol=1e-12
+    )
+
+
+def test_the_safer_the_model_the_farther_it_goes_at_once(held, target) -> None:
+    seen, axis, model = held
+    controller, knowledge = LookAndMoveController(model, axis), HandKnowledge.of(model.hand)
+    knowledge.forces.evidence[:] = 1e6 * torch.eye(knowledge.forces.evidence.shape[-1])
+    safe = []
+    for share in (0.0, 0.1, 0.3, 0.6, 1.0):
+        knowledge.error.square[:] = share**2
+        plan = WholeTurn().plan(controller, seen, target, knowledge, 0.0, whole=True)
+        safe.append(plan.safe)
+        assert bool(plan.against) is (plan.safe < len(plan.waypoints))
+    assert safe[0] == len(plan.waypoints)
+    assert safe == sorted(safe, reverse=True)
+    assert safe[-1] < 4
+
+
+def test_a_movement_is_no_longer_than_it_is_asked_to_be(loop, target) -> None:
+    seen = loop.plant.observe()
+    plan = WholeTurn().plan(loop.controller, seen, target, loop.knowledge, 0.0, whole=True, longest=8 * DEG)
+    assert plan.end.kind is PathEnd.WAY
+    way = torch.stack([one.piece.action for one in plan.waypoints]).sum(0)
+    assert 3 * DEG < float(way.abs().max()) <= 8 * DEG
+
+
+def test_a_turn_that_is_given_up_names_what_is_not_safe(held, loop) -> None:
+    """The object shall be 11 deg off the axis that is held, and the model is sure of nothing."""
+    seen, axis, model = held
+    across = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    there = PoseTarget.turned(PoseTarget.turned(seen.state, across, degrees=11), axis, degrees=10)
+    doubtful = ClosedLoop(Obedient(model, seen), loop.controller, knowledge=loop.knowledge)
+    doubtful.knowledge.error.begin = lambda: doubtful.knowledge.error.square.fill_(1.0)
+    done = doubtful.run(there)
+    del doubtful.knowledge.error.begin
+    assert done.reason is StopReason.GIVEN_UP
+    assert "the object may turn" in done.stop.message
+    assert not any(step.decision.turns for step in done.steps)
+
+
+def test_two_loops_with_different_knowledge_share_no_controller(held, target) -> None:
+    seen, axis, model = held
+    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+    first, second = (ClosedLoop(Obedient(model, seen), controller) for _ in range(2))
+    assert first.knowledge is not second.knowledge or first.knowledge.figures is second.knowledge.figures
+    other = ClosedLoop(Obedient(model, seen), controller, knowledge=HandKnowledge.of(model.hand))
+    for loop in (first, second):
+        with pytest.raises(StateError, match="other knowledge"):
+            next(loop.steps(target))
+        assert not loop.plant.plant.plant.given
+    assert next(other.steps(target)).after is not None
+
+
+def test_contacts_of_links_are_no_pads() -> None:
+    plant = SimulatedHand("icub_right", "tea_tin", preset="none")
+    seen = plant.reset(0)
+    model = KinematicModel(plant.hand, plant.object)
+    controller = LookAndMoveController(model, plant.rotation_axis)
+    far = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=60)
+    plan = WholeTurn().plan(controller, seen, far, HandKnowledge.of(plant.hand), 0.0, whole=True)
+    lin = plan.waypoints[-1].piece.linearization
+    fingers = lin.contacts.finger
+    pads = [i for i, name in enumerate(fingers) if name in {pad.name for pad in plant.hand.pads}]
+    (link,) = set(range(len(fingers))) - set(pads)
+    error = far.error(lin.state)
+    at = controller.situation(lin, seen.a, seen.fingertip_force, error, error[:1])
+    assert at.pads(lin) == pads
+    assert at.normal_force(lin)[link] == float(lin.forces.normal[link])  # no pad measures it
+    about = LinearizedModel.about(0 * seen.a, lin)
+    assert len(GripForceTask().rows(about, at).A) == len(pads)
+    assert len(NormalForceLimit().rows(about, at).C) == 2 * len(pads)
+    grip = controller.grip(lin, at)
+    assert len(grip.force) == len(grip.least) == len(pads)
+    assert isinstance(at, Situation)
