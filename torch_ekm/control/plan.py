@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 
@@ -73,6 +73,7 @@ class Plan:
         return "\n".join([first, *(f"  {left:5.2f} deg to go, {one.band}" for left, one in points)])
 
 
+@runtime_checkable
 class Planner(Protocol):
     """What decides how a loop moves. One of your own needs no more than this method."""
 
@@ -94,6 +95,7 @@ class Planner(Protocol):
         ...
 
 
+@dataclass(frozen=True)
 class OneStep:
     """The loop of the E-KM paper: one step of the controller after the other."""
 
