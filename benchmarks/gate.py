@@ -177,18 +177,15 @@ class WatchedLoop(ClosedLoop):
 
     def _move(self, seen, decision, *args, **options):
         before = self._known()
-        step = super()._move(seen, decision, *args, **options)
+        step, halt = super()._move(seen, decision, *args, **options)
         taught = step.report is not None or any(map(differs, before, self._known()))
-        if step.note.startswith("the object has slid"):  # refused as a jump, and believed in the end
+        if "the object has slid" in step.note:  # refused as a jump, and believed in the end
             self.refused.pop(id(step.after.q), None)
         self.misled += taught and not self.refused.keys().isdisjoint((id(seen.q), id(step.after.q)))
-        return step
+        return step, halt
 
     def _known(self) -> list[torch.Tensor]:
-        parts = self.knowledge, self.controller.pace
-        return [
-            value.clone() for part in parts for value in part.state_dict().values() if torch.is_tensor(value)
-        ]
+        return [value.clone() for value in self.knowledge.state_dict().values() if torch.is_tensor(value)]
 
 
 def differs(one: torch.Tensor, other: torch.Tensor) -> bool:
@@ -207,7 +204,7 @@ def nonsense(knowledge: HandKnowledge, draw: np.random.Generator) -> None:
         case 2:
             servo.estimate[i, 0], servo.covariance[i] = -0.1, 0.0
         case 3:
-            knowledge.pace.fill_(1e9)
+            knowledge.error.square.fill_(1e9)
         case 4:
             figures.mean.fill_(50.0)
         case 5:
