@@ -18,14 +18,14 @@ def test_searched_faults_bring_no_command_above_the_increment_and_teach_nothing(
 
 
 def test_a_loop_that_learns_from_a_refused_reading_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    send = ServoInverse.send
+    send = ServoInverse.send_path
 
-    def rash(self, delta_a, start, by):
-        after = send(self, delta_a, start, by)
+    def rash(self, path, watch, start, by):
+        after = send(self, path, watch, start, by)
         self.learn(after)
         return after
 
-    monkeypatch.setattr(ServoInverse, "send", rash)
+    monkeypatch.setattr(ServoInverse, "send_path", rash)
     (held,) = gate.grasps(("box",))
     count = gate.Count()
     monkeypatch.setattr(
