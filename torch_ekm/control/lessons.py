@@ -104,15 +104,22 @@ class Lessons:
         surprise = felt(controller.kinematic.hand, expected, seen, after)
         if surprise is not None:
             self._learn_forces(expected, surprise)
-        increment = after.state.minus(seen.state)
-        path = [(one.linearization, one.action) for one in expected.pieces]
-        self._figures.learn_path(path, moved, increment - expected.nominal, expected.nominal)
-        return self._learn_residual(expected, increment - expected.increment)
+        return self.learn_increment(expected, moved, after.state.minus(seen.state))
 
-    def _learn_residual(self, expected: Expectation, rest: Tensor) -> UpdateReport | None:
-        """g, piece by piece, each with its share of what was not predicted, of what the figures leave."""
+    def learn_increment(
+        self, expected: Expectation, moved: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
+    ) -> UpdateReport | None:
+        """Figures and g learn: g piece by piece, each with its share of what was not predicted, what the
+        figures leave of it.
+
+        Args:
+            increment: ds, as measured.
+        """
         enhanced, model, report, done = self._controller.enhanced, self._controller.kinematic, None, 0.0
         assert enhanced is not None
+        path = [(one.linearization, one.action) for one in expected.pieces]
+        self._figures.learn_path(path, moved, increment - expected.nominal, expected.nominal)
+        rest = increment - expected.increment
         for one, share in zip(expected.pieces, expected.shares, strict=True):
             lin = one.linearization
             nominal = one.nominal + model.followed(lin).step(one.action) - lin.step(one.action)
