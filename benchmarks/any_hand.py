@@ -286,12 +286,14 @@ class Survey:
         return report
 
 
-def records_by(keys: Mapping[str, Any], results: Mapping[str, Any]) -> dict[Any, list[TrialRecord]]:
+def records_by(
+    keys: Mapping[str, Any], results: Mapping[str, Any], kind: type[TrialRecord] = TrialRecord
+) -> dict[Any, list[Any]]:
     """What finished sessions left, under the key of each; trials without a grasp are left out."""
-    turns: dict[Any, list[TrialRecord]] = defaultdict(list)
+    turns: dict[Any, list[Any]] = defaultdict(list)
     for job, trials in results.items():
-        made = (TrialRecord.from_json(trial) for trial in trials)
-        turns[keys[job]] += [one for one in made if isinstance(one, TrialRecord)]
+        made = (kind.from_json(trial) for trial in trials)
+        turns[keys[job]] += [one for one in made if isinstance(one, kind)]
     return turns
 
 

@@ -5,18 +5,17 @@
 "As printed" is the paper's system around this package's J_m (the printed formulas cannot be right): forces
 from the minimal-force problem alone, no fingertip is read; least motor increments that meet the limited error
 within the motors' ranges; a plain sparse online GP of [q; p; da] with commanded da. It has no servo inverse,
-no grip or force limits, no pace, no retreat, no gates on what teaches, and no figures of the hand. "With
-tasks" adds this package's tasks of grip and off-axis motion, on estimated forces; "J_m as misprinted" takes
-the printed K letter by letter. Grasps, targets, hands and
-stopping rule are those of the other systems. Finished sessions stay in ``--out``: an interrupted run goes on
-where it stopped.
+no grip or force limits, no plan, no bound of a step, no gates on what teaches, and no figures of the hand.
+"With tasks" adds this package's tasks of grip and off-axis motion, on estimated forces; "J_m as misprinted"
+takes the printed K letter by letter. Grasps, targets, hands and stopping rule are those of the other systems.
+Finished sessions stay in ``--out``: an interrupted run goes on where it stopped.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -30,18 +29,13 @@ from torch_ekm.contact.contact_kinematics import ContactKinematics
 from torch_ekm.control import (
     DEFAULT_TASKS,
     ActuatorLimit,
-    Caution,
-    ClosedLoop,
     EffortTask,
     FocusTask,
     Guards,
     LimitingFunction,
     LookAndMoveController,
-    Pace,
-    PaceOptions,
+    OneStep,
     Safety,
-    Step,
-    StepBound,
 )
 from torch_ekm.experiments.config import Setting, digest
 from torch_ekm.experiments.jobs import run_jobs
@@ -53,44 +47,25 @@ from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics.se3 import hat
 from torch_ekm.model import KinematicModel, Linearization
 from torch_ekm.model.stiffness.potential import posture_stiffness
-from torch_ekm.plant import Observation
 from torch_ekm.simulation import PRESETS, preset
 
 WARM_UP = 3
 CAPACITY = 60  # basis vectors; the paper gives no figure
-#: Nothing is undone, tightened, gated or watched for; readings that cannot be are still refused.
-NO_CAUTION = Caution(0, math.inf, -math.inf, 0, 0, 0.0, 0.0, 0)
+#: Nothing is gated or watched for; readings that cannot be are still refused.
 NO_GUARDS = Guards(gate=math.inf, force_ceiling=math.inf, stuck_command=math.inf, wrong_way=10**6)
 
 
 class PrintedController(LookAndMoveController):
     """Contact forces of each state alone: neither pads nor the last forces speak for any."""
 
-    def _linearize(self, state: Any, a: Any, fingertip_force: Any) -> Linearization:
+    def linearize(self, state: Any, a: Any, fingertip_force: Any) -> Linearization:
         return self.kinematic.linearize(state)
 
 
-class PrintedLoop(ClosedLoop):
-    """A turn that stalls stays where it is."""
-
-    def _return_to_best(self, seen: Observation, *unused: Any) -> Generator[Step, None, Observation]:
-        yield from ()
-        return seen
-
-
 class PrintedBench(Bench):
-    """The system as printed; its gain is this package's, for the paper gives none.
-
-    Args:
-        setting: of :func:`as_printed`.
-    """
+    """The system as printed; its gain is this package's, for the paper gives none."""
 
     controllers = PrintedController
-    loops = PrintedLoop
-
-    def __init__(self, setting: Setting, object: Any, controller: str, **options: Any) -> None:
-        super().__init__(setting, object, controller, **options)
-        self.pace = Pace(setting.pace, adapts=False)
 
 
 class MisprintedModel(KinematicModel):
@@ -137,12 +112,13 @@ def without_fingertips(setting: Setting) -> Setting:
 
 def as_printed(setting: Setting) -> Setting:
     """The same hand without fingertips, and the paper's controller and learner."""
-    limiting, bound = LimitingFunction(contact_travel=None), StepBound(least=math.inf)
     return without_fingertips(setting).replace(
         tasks=(EffortTask(), FocusTask()),
         limits=(ActuatorLimit(step=math.inf),),
-        pace=PaceOptions(limiting=limiting, bound=bound),
-        safety=Safety(setting.safety.rule, NO_CAUTION, NO_GUARDS),
+        limiting=LimitingFunction(contact_travel=None),
+        bound=None,
+        planner=OneStep(),
+        safety=Safety(setting.safety.rule, NO_GUARDS),
         servo_inverse=False,
         adapts=False,
         learner="rbf",

@@ -179,7 +179,7 @@ class WatchedLoop(ClosedLoop):
         before = self._known()
         step, halt = super()._move(seen, decision, *args, **options)
         taught = step.report is not None or any(map(differs, before, self._known()))
-        if step.note.startswith("the object has slid"):  # refused as a jump, and believed in the end
+        if "the object has slid" in step.note:  # refused as a jump, and believed in the end
             self.refused.pop(id(step.after.q), None)
         self.misled += taught and not self.refused.keys().isdisjoint((id(seen.q), id(step.after.q)))
         return step, halt

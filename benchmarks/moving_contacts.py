@@ -25,15 +25,13 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent / "kinematic_model"))
 
 from command_line import study_parser
-from slip_announcement import RELEASE, SLIP, STILL, Witness, own_objects, plant_parameters
+from slips import RELEASE, SLIP, STILL, Witness, own_objects, plant_parameters
 
 from torch_ekm._terminal import progress
 from torch_ekm.control import (
     FocusedPose,
     LimitingFunction,
     LookAndMoveController,
-    Pace,
-    PaceOptions,
     PoseTarget,
 )
 from torch_ekm.description import load_object
@@ -72,9 +70,9 @@ def session(item: str, seed: int, plant: str, engine: str) -> dict[str, Any]:
     model = KinematicModel(hand.hand, hand.object, ModelOptions(on_unstable="flag"))
     draw = np.random.default_rng(seed)
     degrees, limit = _FAR * draw.choice([-1.0, 1.0]), np.radians(draw.uniform(1.5, 4.0))
-    pace = Pace(PaceOptions(limiting=LimitingFunction(step=limit)), adapts=False)
     focus = FocusedPose.rotation_about(hand.rotation_axis)
-    controller = LookAndMoveController(KinematicModel(hand.hand, hand.object), focus, pace=pace)
+    limiting = LimitingFunction(step=limit)
+    controller = LookAndMoveController(KinematicModel(hand.hand, hand.object), focus, limiting=limiting)
     target = PoseTarget.turned(seen.state, hand.rotation_axis, np.radians(degrees))
     rows: list[dict[str, Any]] = []
     way, expected, slipped, still = [seen], None, 0, 0

@@ -20,7 +20,14 @@ import torch
 from fuzzed_plant import FuzzedPlant
 from joblib import Parallel, delayed
 
-from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget, StopReason
+from torch_ekm.control import (
+    ClosedLoop,
+    Guards,
+    HandKnowledge,
+    LookAndMoveController,
+    PoseTarget,
+    StopReason,
+)
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.model import KinematicModel
@@ -28,7 +35,7 @@ from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
 from torch_ekm.simulation import PlantConfig, SimulatedHand, preset
 
 DEG = math.pi / 180
-STEP = 16 * DEG  # of ActuatorLimit
+ALLOWED = Guards().increment + 1e-9  # [rad] of a motor, rounding included
 REPAIRS = 8  # of one turn
 CLEAN = (701, 702, 703)  # grasps of the clean turns
 
@@ -67,9 +74,7 @@ class Session:
     reasons: Counter[str] = field(default_factory=Counter)
     commands: int = 0
     largest: float = 0.0
-    """Command to a motor [rad]; the servo inverse adds dead zone and bias to the controller's step."""
-    allowed: float = 0.0
-    """Step of the controller and what the servo model adds at most [rad]."""
+    """Command to a motor [rad]."""
     beyond: float = 0.0
     """Farthest set-point outside the actuators' range [rad]."""
     force: float = 0.0
@@ -95,9 +100,8 @@ def error_of_clean_turns(
         controller = LookAndMoveController(ekm, plant.rotation_axis)
         loop = ClosedLoop(plant, controller, knowledge=knowledge, learn=False)
         for step in loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=18)).steps:
-            lin, moved = step.decision.linearization, step.after.a - step.before.a
             true = step.after.truth.state.minus(step.before.truth.state)
-            off = controller.expect(lin, moved).increment - true
+            off = controller.expect(step.decision.pieces, step.pull).increment - true
             squares.append(float(off[-3:].square().sum()))
     return math.sqrt(sum(squares) / len(squares)) / DEG
 
@@ -141,8 +145,6 @@ def fuzz(seed: int, observations: int, chance: float = 0.15, clean: tuple[int, .
     while sight.observations < observations:
         session.dropped += turn(plant, sight, ekm, knowledge, 1000 * seed + turns, session)
         turns += 1
-        added = (knowledge.servo.dead_zone + knowledge.servo.bias.abs()).max()
-        session.allowed = max(session.allowed, STEP + float(added))
     session.observations, session.faults = sight.observations, sight.faults
     session.commands, session.largest, session.beyond = plant.commands, plant.largest, plant.beyond
     session.force = plant.force
@@ -171,7 +173,7 @@ def main() -> None:
         sessions.append(s)
         print(
             f"seed {s.seed}: {s.observations} observations, {s.commands} commands up to "
-            f"{s.largest / DEG:.1f} of {s.allowed / DEG:.1f} deg, {s.beyond / DEG:.1f} deg beyond the range, "
+            f"{s.largest / DEG:.1f} of {ALLOWED / DEG:.1f} deg, {s.beyond / DEG:.1f} deg beyond the range, "
             f"{s.force:.1f} N; clean turn {s.error:.3f} deg, unfaulted {s.unfaulted:.3f} deg",
             file=sys.stderr,
         )
@@ -190,9 +192,9 @@ def main() -> None:
     dropped, else_dropped = (sum(getattr(s, k) for s in sessions) for k in ("dropped", "dropped_unfaulted"))
     print(f"objects out of the hand: {dropped}; in the same turns without faults: {else_dropped}")
     commands, largest = sum(s.commands for s in sessions), max(s.largest for s in sessions) / DEG
-    above, allowed = sum(s.largest > s.allowed for s in sessions), min(s.allowed for s in sessions) / DEG
+    above = sum(s.largest > ALLOWED for s in sessions)
     print(f"{commands} commands up to {largest:.1f} deg; sessions with one above what is allowed: {above}")
-    print(f"allowed: {allowed:.1f} deg or more, as the servo inverse adds dead zone and bias")
+    print(f"allowed: {ALLOWED / DEG:.1f} deg")
     print(f"farthest set-point out of an actuator's range: {max(s.beyond for s in sessions) / DEG:.1f} deg")
     print(f"largest normal force: {max(s.force for s in sessions):.1f} N")
     print(f"one-step error of clean turns afterwards: {error:.3f} deg; had there been no faults: ", end="")

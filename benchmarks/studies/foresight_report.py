@@ -9,25 +9,22 @@ import numpy as np
 from bars import Target, targets_table
 
 from torch_ekm.control import StopReason
-from torch_ekm.description import load_hand, load_object
-from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.reporting import statistics as stats
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, FigureFile, Report, Table
 from torch_ekm.experiments.reporting.statistics import DataFrame, Series
 from torch_ekm.experiments.reporting.tables import which_seeds
 from torch_ekm.experiments.reporting.trials import select
-from torch_ekm.rendering import make_scene, save_animation
 
 #: A target is declined where it lies this far beyond the predicted reach [deg].
 BEYOND_DEG = 2.0
 _NINETY = 1.645  # standard deviations on either side that hold 90 % of a Gaussian
-ONE_STEP = "one-step E-KM"
+PLANNED = "E-KM"
 _BLIND = "blind", "blind, looks again", "blind, no touch"
 _FREE = "nothing"
 _LEGEND = {
-    ONE_STEP: "each motion is chosen for itself",
-    "oracle": "each motion is chosen for itself, by the true model, pose and forces",
+    PLANNED: "plans by f + g, as they are learned",
+    "oracle": "plans by the true model, from true poses and forces, without doubts",
 }
 
 
@@ -50,30 +47,30 @@ def covered(turns: DataFrame) -> Series:
 
 
 def by_contender(trials: DataFrame, kind: str | None = None) -> dict[str, DataFrame]:
-    """Turns of one kind, or all, of each contender that has any, the one-step controller first."""
+    """Turns of one kind, or all, of each contender that has any, the E-KM first."""
     wanted = {} if kind is None else {"kind": kind}
     found = {name: mine for name, mine in select(trials, **wanted).groupby("contender", sort=False)}
-    return {str(name): found[name] for name in sorted(found, key=lambda name: name != ONE_STEP)}
+    return {str(name): found[name] for name in sorted(found, key=lambda name: name != PLANNED)}
 
 
 def _same_grasps(trials: DataFrame, contender: str) -> DataFrame:
-    """Largest angles [deg] of a contender and of the one-step controller on each grasp, ``(n, 2)``."""
+    """Largest angles [deg] of a contender and of the E-KM on each grasp, ``(n, 2)``."""
     far = select(trials, kind="far").pivot(
         index=["object", "seed"], columns="contender", values="largest_deg"
     )
-    return far.reindex(columns=[contender, ONE_STEP]).dropna()
+    return far.reindex(columns=[contender, PLANNED]).dropna()
 
 
 def paired_ratio(trials: DataFrame, contender: str) -> float | None:
-    """Median of the largest angle over that of the one-step controller, on the same grasps."""
+    """Median of the largest angle over that of the E-KM, on the same grasps."""
     ours, theirs = _same_grasps(trials, contender).to_numpy().T
     turned = theirs > 1.0
     return float(np.median(ours[turned] / theirs[turned])) if turned.any() else None
 
 
 def _agreement(trials: DataFrame, contender: str) -> Cell:
-    """How often a contender's turn ends within 2 deg of the one-step controller's."""
-    if contender == ONE_STEP:
+    """How often a contender's turn ends within 2 deg of the E-KM's."""
+    if contender == PLANNED:
         return None
     ours, theirs = _same_grasps(trials, contender).to_numpy().T
     return stats.rate(np.abs(ours - theirs) <= 2)
@@ -82,7 +79,7 @@ def _agreement(trials: DataFrame, contender: str) -> Cell:
 def foresight_targets(trials: DataFrame) -> list[Target]:
     """What was aimed at before the figures were known."""
     found: list[Target] = []
-    mine = select(trials, contender=ONE_STEP)
+    mine = select(trials, contender=PLANNED)
     errors, blind = reach_errors(select(mine, kind="far")), select(mine, kind="blind")
     if len(errors):
         for off, least in ((2, 70), (5, 90)):
@@ -95,8 +92,8 @@ def foresight_targets(trials: DataFrame) -> list[Target]:
     return found
 
 
-def foresight_report(setting: Setting, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
-    """The answer, the tables, two figures and an animation."""
+def foresight_report(seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
+    """The answer, the tables and a figure."""
     tables = [
         far_table(trials),
         reach_table(trials),
@@ -105,8 +102,8 @@ def foresight_report(setting: Setting, seeds: Sequence[int], trials: DataFrame, 
         targets_table(foresight_targets(trials)),
     ]
     turns = by_contender(trials)
-    mine = turns.get(ONE_STEP, trials[:0])
-    figures = [*_reach_plot(mine, folder), *_blind_plot(turns, folder), *_animation(setting, trials, folder)]
+    mine = turns.get(PLANNED, trials[:0])
+    figures = [*_reach_plot(mine, folder)]
     title = "Foresight: how far, and what ends it; turns with the camera off"
     ends = [f"{name} {_ends(found)}" for name, found in turns.items()]
     summary = f"{_answer(trials)} Objects lost: {', '.join(ends)}. {which_seeds(seeds)}"
@@ -121,7 +118,7 @@ def _ends(turns: DataFrame) -> str:
 
 
 def _answer(trials: DataFrame) -> str:
-    parts, mine = [], select(trials, contender=ONE_STEP)
+    parts, mine = [], select(trials, contender=PLANNED)
     errors, blind = reach_errors(select(mine, kind="far")).abs(), select(mine, kind="blind")
     if len(errors):
         parts.append(
@@ -136,8 +133,8 @@ def _answer(trials: DataFrame) -> str:
         )
     for name in by_contender(trials):
         ratio = paired_ratio(trials, name)
-        if name != ONE_STEP and ratio is not None:
-            parts.append(f"{name} turns {ratio:.2f} times as far as the one-step E-KM (median).")
+        if name != PLANNED and ratio is not None:
+            parts.append(f"{name} turns {ratio:.2f} times as far as the E-KM (median).")
     return " ".join(parts) or "Nothing was grasped."
 
 
@@ -148,8 +145,8 @@ def far_table(trials: DataFrame) -> Table:
             mine["largest_deg"].to_numpy()
         ),
         Column("median [deg]", ".1f"): lambda mine: float(mine["largest_deg"].median()),
-        Column(f"paired, {ONE_STEP} = 1"): lambda mine: paired_ratio(trials, mine["contender"].iloc[0]),
-        Column(f"within 2 deg of {ONE_STEP}"): lambda mine: _agreement(trials, mine["contender"].iloc[0]),
+        Column(f"paired, {PLANNED} = 1"): lambda mine: paired_ratio(trials, mine["contender"].iloc[0]),
+        Column(f"within 2 deg of {PLANNED}"): lambda mine: _agreement(trials, mine["contender"].iloc[0]),
         Column("not reached"): lambda mine: stats.rate(mine["not_reached"]),
         Column("lost"): lambda mine: stats.rate(mine["lost"]),
     }
@@ -162,12 +159,12 @@ def far_table(trials: DataFrame) -> Table:
 
 
 def reach_table(trials: DataFrame) -> Table:
-    """How well the end was predicted; of the one-step controller for each object and how the turn ended."""
+    """How well the end was predicted; of the E-KM for each object and how the turn ended."""
     items: dict[str, DataFrame] = {}
     for name, found in by_contender(trials, "far").items():
         mine = found[found["reach_deg"].notna()]
         items[f"{name}, all"] = mine
-        if name == ONE_STEP:
+        if name == PLANNED:
             items |= _each("object", mine) | _each("reason", mine)
     columns: dict[Column, Callable[[DataFrame], Cell]] = {
         Column("grasps"): lambda mine: len(reach_errors(mine)),
@@ -179,7 +176,7 @@ def reach_table(trials: DataFrame) -> Table:
     }
     items = {name: mine for name, mine in items.items() if len(reach_errors(mine))}
     note = (
-        f"Predicted less real largest angle. Of the {ONE_STEP} also for each object and, below, by how the "
+        f"Predicted less real largest angle. Of the {PLANNED} also for each object and, below, by how the "
         "turn really ended."
     )
     return Table.of("reach", "Predicted ends of turns", "turns", items, columns, note)
@@ -213,7 +210,7 @@ def blind_table(trials: DataFrame) -> Table:
         for kind in _BLIND:
             mine = found[found["kind"] == kind]
             items[f"{name}, {kind}, all"] = mine
-            if name == ONE_STEP:
+            if name == PLANNED:
                 items |= _each("object", mine, f"{kind}, ")
     columns: dict[Column, Callable[[DataFrame], Cell]] = {
         Column("median error [deg]"): lambda mine: float(mine["true_error_deg"].median()),
@@ -228,7 +225,7 @@ def blind_table(trials: DataFrame) -> Table:
     note = (
         "The camera is off from the first reading on. True error about the axis at the end; error of the "
         "estimate and its stated standard deviation likewise. 'No touch': the prediction alone. "
-        f"Single objects: {ONE_STEP}."
+        f"Single objects: {PLANNED}."
     )
     return Table.of("blind", "Whole turns with the camera off", "kind", items, columns, note)
 
@@ -244,7 +241,7 @@ def _rms(values: Series) -> float | None:
 
 
 def _reach_plot(turns: DataFrame, folder: Path) -> list[FigureFile]:
-    """Predicted against real ends of the one-step controller's turns."""
+    """Predicted against real ends of the E-KM's turns."""
     far = turns[(turns["kind"] == "far") & turns["reach_deg"].notna()]
     if far.empty:
         return []
@@ -258,52 +255,5 @@ def _reach_plot(turns: DataFrame, folder: Path) -> list[FigureFile]:
         axis.plot(real[mine], predicted[mine], "osD^v*PX"[k % 8], label=label, markersize=5)
     axis.set(xlabel="real end [deg]", ylabel="predicted end [deg]", xlim=(0, top), ylim=(0, top))
     axis.legend(frameon=False, fontsize=8)
-    caption = "Ends of the one-step E-KM's turns, and the model's predictions before the first motion."
+    caption = "Ends of the E-KM's turns, and the model's predictions before the first motion."
     return [save_figure(figure, folder, "reach", caption)]
-
-
-def _blind_plot(turns: dict[str, DataFrame], folder: Path) -> list[FigureFile]:
-    """Errors of turns with the camera off, by contender."""
-    blind = {name: mine[mine["kind"].isin(_BLIND) & ~mine["lost"]] for name, mine in turns.items()}
-    blind = {name: mine for name, mine in blind.items() if len(mine)}
-    if not blind:
-        return []
-    figure, (axis,) = new_figure(5.0, 3.2)
-    width = 0.8 / len(blind)
-    for j, (name, mine) in enumerate(blind.items()):
-        for k, kind in enumerate(_BLIND):
-            errors = mine[mine["kind"] == kind]["true_error_deg"].sort_values()
-            middle = k + (j - (len(blind) - 1) / 2) * width
-            places = middle + width * np.linspace(-0.3, 0.3, len(errors))
-            axis.plot(places, errors, "o", color=f"C{j}", markersize=2.5, label=None if k else name)
-            if len(errors):
-                axis.plot(middle + width * np.array([-0.4, 0.4]), [errors.median()] * 2, color="black")
-    axis.set_xticks(range(len(_BLIND)), list(_BLIND))
-    axis.set(ylabel="true error [deg]", ylim=(0, None))
-    axis.legend(frameon=False, fontsize=8, markerscale=2)
-    caption = "Whole turns with the camera off, without lost ones: each turn, in order, and the median."
-    return [save_figure(figure, folder, "blind", caption)]
-
-
-def _animation(setting: Setting, trials: DataFrame, folder: Path) -> list[FigureFile]:
-    """The farthest turn that was predicted, with the predicted object as a ghost."""
-    far = select(trials, kind="far", lost=False)
-    far = far[(far["poses"].map(len) > 0) & (far["predicted"].map(len) > 0)]
-    if far.empty:
-        return []
-    turn = far.loc[far["largest_deg"].idxmax()]
-    hand, obj = load_hand(setting.hand), load_object(turn["object"])
-    n = len(turn.poses)
-    predicted = [turn.predicted[min(k, len(turn.predicted) - 1)] for k in range(n)]
-    q, position, rotation = (np.array(part) for part in zip(*turn.poses, strict=True))
-    _, ghost_position, ghost_rotation = (np.array(part) for part in zip(*predicted, strict=True))
-    scene = make_scene(
-        hand, obj, q, position, rotation, np.array(hand.gravity), ghost=(ghost_position, ghost_rotation)
-    )
-    save_animation(scene, folder / "animation.html")
-    what = f"{turn.object.replace('_', ' ')}, {turn.contender}, seed {turn.seed}"
-    return [
-        FigureFile(
-            "animation.html", f"To the end of the reach ({what}); see-through: as the model predicted it."
-        )
-    ]

@@ -36,7 +36,7 @@ _FIRST_WARM_UP, _FAR, _BLIND = 1000, 3000, 4000  # numbers of the grasps
 WIDE = ("tea_tin", "jar")
 #: Who is compared: name -> bench, and its controller.
 CONTENDERS: dict[str, tuple[type[Bench], str]] = {
-    "one-step E-KM": (Bench, "E-KM"),
+    "E-KM": (Bench, "E-KM"),
     "oracle": (OracleBench, "KM+S"),
 }
 
@@ -86,7 +86,7 @@ class Foresight(Protocol):
     def quick(self) -> Self:
         """One wide object, one contender, one turn of training."""
         small = {"far_deg": 40.0, "factor": 0.0, "blind_angle_deg": 6.0, "warm_up": 1}
-        return dataclasses.replace(self, objects=("tea_tin",), contenders=("one-step E-KM",), **small)
+        return dataclasses.replace(self, objects=("tea_tin",), contenders=("E-KM",), **small)
 
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, str, int]]:
         """One for each seed, object and contender."""
@@ -127,7 +127,7 @@ class Foresight(Protocol):
             records.append(turn("blind, looks again", _BLIND, self.blind_angle_deg, **again, **dark))
             records.append(turn("blind, no touch", _BLIND, self.blind_angle_deg, **dark))
         if self.far_deg:
-            records.append(turn("far", _FAR, self.far_deg, poses=True))
+            records.append(turn("far", _FAR, self.far_deg))
         records += [turn("turn", trial, angle) for trial, angle in enumerate(self.angles_of(object))]
         bench.close()
         return records
@@ -148,15 +148,12 @@ class Foresight(Protocol):
                 "axis_std_deg": stated["axis_std"] / _DEG, "estimate_error_deg": error / _DEG, "looks": looks,
             }  # fmt: skip
         if reach is not None:
-            dark |= {"reach_deg": sign * reach.angle / _DEG, "reach_end": reach.ends_by}
-            if done.poses:
-                way = ([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in reach.path)
-                dark["predicted"] = tuple(way)
+            dark |= {"reach_deg": sign * reach.angle / _DEG, "reach_end": str(reach.end)}
         return ForesightTurn(**vars(done), contender=contender, largest_deg=max(angles) / _DEG, **dark)
 
     def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
-        """Answer, tables, figures, and a turn next to what was predicted of it."""
-        return foresight_report(self.setting, seeds, trials, folder)
+        """Answer, tables and figures."""
+        return foresight_report(seeds, trials, folder)
 
 
 def reach_of(bench: Bench, angle_deg: float) -> Reach | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from torch_ekm.experiments.records import TrialRecord
 
@@ -25,5 +24,3 @@ class ForesightTurn(TrialRecord):
     """Of the estimated rotation about the axis at the end, with the camera off, by the truth."""
     looks: int = 0
     """How often the camera was asked while it was off."""
-    predicted: tuple[Any, ...] = ()
-    """Joint angles, position and rotation on the predicted way, for pictures."""

@@ -1,9 +1,9 @@
 """What does the physics allow? ``python oracle.py --objects tea_tin,carton --seeds 1000:1010``
 
 On the same grasps and angles as ``torch-ekm reproduce generalize``: the E-KM with camera and Hall sensors,
-and an oracle, which chooses each motion by the true model of hand and object, the true pose and the true
-contact forces. Where both end away from the target, no better model would help. Interrupted, it goes on where
-it stopped.
+and an oracle, which plans with the true model of hand and object, the true pose and the true contact forces.
+It has no doubts: it goes on until its model says that a finger leaves the object, or that this is dislocated.
+Where both end away from the target, no better model would help. Interrupted, it goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from torch_ekm.cli._app import parse_seeds
-from torch_ekm.control import StopReason
+from torch_ekm.control import StoppingRule, StopReason, WholeTurn
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.protocols.generalize import Generalize
@@ -31,6 +31,7 @@ from torch_ekm.simulation import SimulatedHand
 from torch_ekm.simulation.mechanism.assembly import true_hand, true_object
 
 _REACHED = StopReason.REACHED.value
+_NO_DOUBTS = WholeTurn(deviations=0.0, off_rotation=StoppingRule().off_limit, force=0.0)
 
 
 class Omniscient(PlantWrapper):
@@ -53,8 +54,8 @@ def true_model(plant: SimulatedHand, options: ModelOptions) -> KinematicModel:
 class OracleBench(Bench):
     """A bench whose model is the plant's own, and whose pose, joints and forces are the true ones."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
+    def __init__(self, setting: Setting, *arguments: Any, **options: Any) -> None:
+        super().__init__(setting.replace(planner=_NO_DOUBTS), *arguments, **options)
         self.plant = Omniscient(self.plant)
         self.model = true_model(self.hand, self.setting.model)
 

@@ -23,8 +23,9 @@ GROUPS = {
         "torch_ekm.control",
         ["ActuatorLimit", "JointLimit", "NormalForceLimit"],
     ),
-    "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound", "TrustRegion"]),
-    "Closed loop": ("torch_ekm.control", ["StoppingRule", "Caution", "Guards"]),
+    "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound"]),
+    "Plan": ("torch_ekm.control", ["WholeTurn"]),
+    "Closed loop": ("torch_ekm.control", ["StoppingRule", "Guards"]),
     "Simulation": ("torch_ekm.simulation", ["PlantConfig", "ImageQuality"]),
 }
 

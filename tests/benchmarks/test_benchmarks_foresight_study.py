@@ -39,7 +39,6 @@ def test_a_session_says_what_was_predicted_and_what_came(tmp_path: Path) -> None
     assert isinstance(alone, ForesightTurn)
     assert far.reach_end == "nothing"
     assert far.largest_deg == pytest.approx(8.0, abs=1.5)
-    assert len(far.predicted) > 1
     assert far.axis_std_deg is None
     assert dark.reach_deg is None
     assert dark.axis_std_deg is not None
@@ -50,7 +49,6 @@ def test_a_session_says_what_was_predicted_and_what_came(tmp_path: Path) -> None
     assert dark.looks == 0
     names = [table.name for table in made.tables]
     assert names == ["far", "blind", "targets"]  # nothing ended, so nothing was predicted of an end
-    assert (tmp_path / "animation.html").stat().st_size > 100_000
     assert "blind turn of 5 deg" in made.summary
 
 
@@ -69,7 +67,7 @@ def turn(**figures) -> ForesightTurn:
         "object": "box", "kind": "far", "controller": "E-KM", "seed": 0, "trial": 0, "angle_deg": 70.0,
         "reason": "given up", "message": "", "true_error_deg": 1.0, "first_step_deg": None,
         "step_error_deg": None, "true_prediction_ekm_deg": (), "off_rotation_deg": 0.0,
-        "contender": report.ONE_STEP,
+        "contender": report.PLANNED,
     }  # fmt: skip
     return ForesightTurn(**{**about, **known, **figures})
 
@@ -91,7 +89,7 @@ def test_what_is_made_of_the_figures() -> None:
         for t, d in zip(turns, (-1.9, 3.0, 0.5), strict=True)
     ]
     rows = {row[0]: row for row in report.far_table(trial_frame({"a": [*turns, *nearer]}, 60)).rows}
-    assert (rows["oracle"][4].count, rows["oracle"][4].n, rows[report.ONE_STEP][4]) == (2, 3, None)
+    assert (rows["oracle"][4].count, rows["oracle"][4].n, rows[report.PLANNED][4]) == (2, 3, None)
     met = {target.what: target for target in report.foresight_targets(both)}
     assert met["reach predicted within 2 deg [% of grasps]"].measured == 50
     blind = [turn(estimate_error_deg=e, axis_std_deg=0.3) for e in (0.1, -0.45, 0.6)]

@@ -1,4 +1,4 @@
-"""The benchmark of the last gate, with 600 readings, and that it would see what it is to find."""
+"""The benchmark of the last gate, with 2,000 readings, and that it would see what it is to find."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from torch_ekm.plant import ServoInverse
 
 @pytest.mark.slow
 def test_searched_faults_bring_no_command_above_the_increment_and_teach_nothing() -> None:
-    count = gate.search(600, each=75, seed=0)
-    assert count.readings >= 600
-    assert count.commands > 300
+    count = gate.search(2000, each=250, seed=0)
+    assert count.readings >= 2000
+    assert count.commands > 1000
     assert (count.above, count.not_finite, count.learned) == (0, 0, 0)
     assert len(count.reasons) > 5  # faults of many kinds were found out
 
@@ -20,8 +20,8 @@ def test_searched_faults_bring_no_command_above_the_increment_and_teach_nothing(
 def test_a_loop_that_learns_from_a_refused_reading_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     send = ServoInverse.send_path
 
-    def rash(self, *movement):
-        after = send(self, *movement)
+    def rash(self, path, watch, start, by):
+        after = send(self, path, watch, start, by)
         self.learn(after)
         return after
 

@@ -18,7 +18,7 @@ from ablation import DISTURBANCES, Ablation, variants
 from foresight_study import Foresight
 from foresight_turn import ForesightTurn
 from made_up_sessions import made_up_generalize, made_up_turn
-from oracle import OracleGeneralize, run
+from oracle import run
 from oracle import table as oracle_table
 
 from torch_ekm.experiments.protocols.generalize import Generalize
@@ -70,10 +70,7 @@ def test_ablation_covers_every_disturbance_of_the_nominal_plant() -> None:
             ]
             assert set(different) == set(DISTURBANCES[variant.name]), variant.name
     jobs = protocol.jobs((0,))
-    places = {(job.objects, job.angles_deg) for job, _, _ in jobs.values()}
-    assert places == {(("box",), (9.0, 19.0, 29.0)), (("tea_tin",), (10.0, 20.0, 25.0))}
-    oracle = next(job for job, _, _ in jobs.values() if isinstance(job, OracleGeneralize))
-    assert oracle.objects == ("tea_tin",)
+    assert {(job.objects, job.angles_deg) for job, _, _ in jobs.values()} == {(("box",), (9.0, 19.0, 29.0))}
     # alike variants share their jobs
     assert len(jobs) < sum(len(v.controllers) for v in variants(protocol.setting))
 

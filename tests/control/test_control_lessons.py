@@ -9,8 +9,15 @@ import pytest
 import torch
 from obedient_plant import Obedient
 
-from torch_ekm.control import ClosedLoop, DescribedFigures, HandFigures, LookAndMoveController, PoseTarget
-from torch_ekm.control.lessons import learn
+from torch_ekm.control import (
+    ClosedLoop,
+    DescribedFigures,
+    HandFigures,
+    HandKnowledge,
+    LookAndMoveController,
+    PoseTarget,
+)
+from torch_ekm.control.lessons import Lessons
 from torch_ekm.enhanced import EnhancedModel
 
 DEG = math.pi / 180
@@ -91,11 +98,12 @@ def test_g_learns_each_piece_with_its_share(taught, pieces, monkeypatch) -> None
     came, told = expected.increment + rest, []
     update = controller.enhanced.update
     monkeypatch.setattr(controller.enhanced, "update", lambda *lesson: told.append(lesson) or update(*lesson))
-    learn(controller, DescribedFigures(), expected, expected.moved, came)
+    lessons = Lessons(controller, HandKnowledge.of(controller.kinematic.hand), DescribedFigures())
+    lessons._learn_residual(expected, rest)
     there = start = pieces[0].state
     ways = torch.stack([one.action.norm() for one in pieces])
-    lessons = zip(told, expected.pieces, ways / ways.sum(), strict=True)
-    for (state, w, increment, nominal), one, share in lessons:
+    parts = zip(told, expected.pieces, ways / ways.sum(), strict=True)
+    for (state, w, increment, nominal), one, share in parts:
         torch.testing.assert_close(increment, one.increment + share * rest)
         torch.testing.assert_close(nominal, one.nominal)
         assert w is one.action
@@ -103,7 +111,8 @@ def test_g_learns_each_piece_with_its_share(taught, pieces, monkeypatch) -> None
         there = there.plus(increment)
     assert float((there.minus(start) - came)[-3:].norm()) < 0.05 * DEG
     for _ in range(30):
-        learn(controller, DescribedFigures(), controller.expect(pieces, expected.moved), expected.moved, came)
+        again = controller.expect(pieces, expected.moved)
+        lessons._learn_residual(again, came - again.increment)
     left = (came - controller.expect(pieces, expected.moved).increment)[-3:].norm()
     assert float(left) < 0.1 * float(rest[-3:].norm())
 

@@ -63,7 +63,7 @@ def reproduce(
     angles: Annotated[str, Option(help="Turns [deg], e.g. 5,10; else shares of each end (generalize).")] = "",
     step: Annotated[
         float | None,
-        Option(help="Turn of one motion at pace 1 [deg]; 2.5 if left out (less where a contact moves far)."),
+        Option(help="Largest step without a plan [deg]; 2.5 if left out (less where a contact moves far)."),
     ] = None,
 ) -> None:
     """Repeat the paper's experiments.

@@ -137,7 +137,7 @@ def health(
 def knowledge(
     file: Annotated[Path, Argument(metavar="EKM", help="File of what a closed loop has learned of a hand.")],
     hand: Annotated[str, Option(help="The hand; else the one that it was learned of.")] = "",
-    reset: Annotated[list[str], Option(help="servo, forces, figures or pace: forget it; repeatable.")] = [],  # noqa: B006
+    reset: Annotated[list[str], Option(help="servo, forces, figures or error: forget it; repeatable.")] = [],  # noqa: B006
     json: Annotated[bool, Option("--json", help="All figures, as JSON.")] = False,
 ) -> None:
     """Show what is believed of a hand, since when, and where that differs from its description.

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from ..estimation.hand_figures import HandFigures
 from ..kinematics import GraspState
-from ..typing import Array
+from ..typing import Array, Tensor
 from .decision import Band, Piece
 from .model_error import NOISE
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from .focus import PoseTarget
     from .knowledge import HandKnowledge
 
-_DEG = math.pi / 180
 _LEVER = 0.03  # [m]: a share of a rotation counts as much as that share of this translation
 _SHARE = 0.15  # of the way that a normal force has come: what the model does not know of it
 
@@ -43,9 +43,9 @@ class Bands:
         target: PoseTarget,
     ) -> None:
         self._controller, self._knowledge, self._target = controller, knowledge, target
-        self._start, n_pads = seen.state, len(controller.kinematic.hand.pads)
+        n_pads = len(controller.kinematic.hand.pads)
         self._force = seen.fingertip_force
-        self._figures = np.zeros((6, 0))
+        self._slopes: Array | None = None  # G
         self._g, self._way = np.zeros(6), np.zeros(3)
         self._pull = torch.zeros_like(seen.a)
         self._said = torch.zeros(n_pads, dtype=torch.float64)  # S w
@@ -54,40 +54,37 @@ class Bands:
 
     def add(self, piece: Piece, state: GraspState) -> Band:
         """One more piece, which leads to a state."""
-        controller, hand = self._controller, self._controller.kinematic.hand
-        twist, lin = piece.increment[-6:].numpy(), piece.linearization
-        self._way = self._way + twist[3:]
+        controller, focus = self._controller, self._controller.focus
+        self._way = self._way + piece.increment[-3:].numpy()
         self._pull = self._pull + piece.action
+        covariance, figures = self._of_model(), self._knowledge.figures
         if controller.enhanced is not None:
             _, variance = controller.enhanced.correction(piece.state, piece.action, state.n_s)
             self._g += variance[-6:].sqrt().numpy()
-        cov = np.diag(self._g**2)
-        figures = self._knowledge.figures
-        slopes = None if controller.enhanced is None else figures.twist_slopes(lin, piece.action)
-        if slopes is not None:
-            self._figures = self._figures + slopes if self._figures.size else slopes
-            cov += self._figures @ self._knowledge.figures.covariance.numpy() @ self._figures.T
-        cov += self._of_model()
-        focus = controller.focus
+            covariance += np.diag(self._g**2)
+            slopes = figures.twist_slopes(piece.linearization, piece.action)
+            if slopes is not None and isinstance(figures, HandFigures):
+                self._slopes = slopes if self._slopes is None else self._slopes + slopes
+                covariance += self._slopes @ figures.covariance.numpy() @ self._slopes.T
         rows = focus.off_matrix[~focus.off_translation].numpy()
-        off_std = (
-            math.sqrt(max(float(np.linalg.eigvalsh(rows @ cov @ rows.T)[-1]), 0.0)) if len(rows) else 0.0
-        )
+        spread = np.linalg.eigvalsh(rows @ covariance @ rows.T).max(initial=0.0)
         off = focus.off_rotation(self._target.error(state))
-        force = force_std = None
-        if self._force is not None and piece.force is not None:
-            rows_, pads = hand.pad_rows(lin.contacts.finger)
-            if self._pads is None:
-                self._pads, self._last = pads, self._force
-            self._said[pads] += (lin.described_normal_sensitivity @ piece.action)[rows_]
-            self._swing += (piece.force - self._last).abs().nan_to_num()
-            self._last = piece.force
-            known = torch.zeros(len(self._said), dtype=torch.bool)
-            known[self._pads] = True
-            force = piece.force.nan_to_num().where(known, torch.nan)
-            spread = self._knowledge.forces.spread(self._pull, self._said)
-            force_std = (spread.square() + (_SHARE * self._swing).square()).sqrt()
-        return Band(off, off_std, torch.from_numpy(np.sqrt(cov.diagonal())), force, force_std)
+        twist_std = torch.from_numpy(np.sqrt(covariance.diagonal()))
+        return Band(off, math.sqrt(spread), twist_std, *self._of_forces(piece))
+
+    def _of_forces(self, piece: Piece) -> tuple[Tensor | None, Tensor | None]:
+        """Forces of the pads that touched at the start and their deviations; None: not measured."""
+        if self._force is None or piece.force is None:
+            return None, None
+        rows, pads = self._controller.kinematic.hand.pad_rows(piece.linearization.contacts.finger)
+        self._pads = pads if self._pads is None else self._pads
+        self._said[pads] += (piece.linearization.described_normal_sensitivity @ piece.action)[rows]
+        self._swing += (piece.force - self._force).abs().nan_to_num()
+        self._force = piece.force
+        force = torch.full_like(piece.force, torch.nan)
+        force[self._pads] = piece.force.nan_to_num()[self._pads]
+        spread = self._knowledge.forces.spread(self._pull, self._said)
+        return force, (spread.square() + (_SHARE * self._swing).square()).sqrt()
 
     def _of_model(self) -> Array:
         """Covariance of what neither figures nor g know: shares of the way, and noise."""

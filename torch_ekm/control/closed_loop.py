@@ -14,10 +14,8 @@ from .._checks import check_kind
 from .._extras import require
 from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import StateError
-from ..model import Linearization
 from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
 from ..plant.frames_at_rest import mean_reading
-from ..residual import UpdateReport
 from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
 from .controller import LookAndMoveController
@@ -26,21 +24,18 @@ from .ends import Ends, hindrances
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
 from .learned import Learned
-from .lessons import felt, learn, learn_forces
+from .lessons import Lessons
 from .manipulation import Manipulation, Step, Stop
-from .model_error import NOISE
 from .plan import OneStep, Plan, Planner, WholeTurn
 from .reach import Reach, Reachability, out_of_reach, reach, reachability
 from .safety import Safety
 from .safety.on_the_way import OnTheWay
 from .safety.safety import Objection
-from .safety.watch import Verdict, Watch
+from .safety.watch import Watch
 
 _DEG = math.pi / 180
-_GRIPS = 3  # movements that only grip, before the first turn
-_FULL, _LEAST = 0.9, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
-_SLIP = 0.5  # [N] by which the grip is tightened where the object moved otherwise than predicted:
-_SLIPS, _SHARE = 2.0, 0.15  # deviations from which it is thought to slide, of a model that errs by this share
+_GRIPS = 2  # movements that only grip, before the first turn
+_FULL, _LEAST = 0.75, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
 
 
 class ClosedLoop:
@@ -103,6 +98,7 @@ class ClosedLoop:
         self._gate = Gate(plant, hand, increment=guards.increment, speed=guards.speed)
         self.plant, self.knowledge = ServoInverse(self._gate, hand, knowledge.servo), knowledge
         self.learned = Learned(knowledge, controller)
+        self._lessons = Lessons(controller, knowledge, self._figures)
         self._stop = threading.Event()
         require("qpsolvers")  # now, not within the first movement; so with the learner's loops
         if learn and controller.enhanced is not None:
@@ -234,12 +230,8 @@ class ClosedLoop:
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
-                more = ends.surprise + watch.suspects(seen)
-                return Stop(
-                    decision.status,
-                    seen,
-                    "; ".join(filter(None, (decision.message, plan.end.message))) + more,
-                )
+                said = "; ".join(filter(None, (decision.message, plan.end.message)))
+                return Stop(decision.status, seen, said + ends.surprise + watch.suspects(seen))
             weak = "" if turns or not decision.turns else watch.weak(decision, seen)
             if weak:
                 return Stop(StopReason.WEAK_GRASP, seen, weak)
@@ -257,9 +249,8 @@ class ClosedLoop:
         while mean.status is PlantStatus.HELD and len(readings) < rule.most_looks:
             n, error = len(readings), ends.error(mean)
             doubt = watch.readings.pose_noise(seen, self.controller.focus) / math.sqrt(n)
-            if error > rule.tolerance + 3 * doubt or (
-                n >= rule.looks and abs(error - rule.tolerance) > doubt
-            ):
+            clear = n >= rule.looks and abs(error - rule.tolerance) > doubt
+            if clear or error > rule.tolerance + 3 * doubt:
                 break
             another = watch.rest(seen, self.plant.observe())
             if another is seen:
@@ -273,33 +264,33 @@ class ClosedLoop:
     ) -> tuple[Step, Objection | None]:
         """Command, observe, learn; why the manipulation must end here, if it must."""
         first, stopped = self._command(seen, decision)
-        began = time.perf_counter()
+        began, controller, figures, report = time.perf_counter(), self.controller, self._figures, None
 
         def expect(moved: Tensor) -> Expectation:
-            return self.controller.expect(decision.pieces, self._figures.pulled(moved))
+            return controller.expect(decision.pieces, figures.pulled(moved))
 
         verdict = watch.motion(seen, decision, self.plant.sent, first, expect, self.plant.observe)
         after, halt, expected = verdict.seen, verdict.halt, verdict.expected
-        increment, moved = after.state.minus(seen.state), after.a - seen.a
-        if halt is not None or after.status is PlantStatus.LOST:  # nobody learns from this reading
-            seconds += time.perf_counter() - began
-            return Step(seen, decision, after, increment, moved, None, seconds, verdict.note), halt
-        self.knowledge.checkpoint()
-        if verdict.encoders:
-            self.plant.learn(after)
-        halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
-        report = None
-        if expected is not None and after.status is PlantStatus.HELD:
-            report = self._learn(seen, decision, after, moved, verdict, halt is None)
-        self.controller.previous = self._forces_there(seen, decision)
-        pull = self._figures.commit(moved, after.a)
+        increment, pull = after.state.minus(seen.state), after.a - seen.a
+        if halt is None and after.status is not PlantStatus.LOST:  # else nobody learns from this reading
+            moved = pull
+            self.knowledge.checkpoint()
+            if verdict.encoders:
+                self.plant.learn(after)
+            halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
+            if expected is not None and after.status is PlantStatus.HELD and self.learn:
+                if seen.status is PlantStatus.HELD:  # both ends were measured
+                    self._lessons.judge(decision, expected, increment)
+                if verdict.teaches and halt is None:
+                    report = self._lessons.learn(seen, decision, after, moved, expected)
+            controller.went(seen.a, decision.pieces)
+            pull = figures.commit(moved, after.a)
+            if decision.turns:
+                ends.add(after, decision.limited)
+                if watch.gated and expected is not None and not (watch.blind or watch.slid):
+                    ends.leapt(float((increment - expected.increment)[-3:].norm()), verdict.note)
+                halt = halt or watch.way(ends.errors, decision, moved)
         seconds += time.perf_counter() - began
-        if decision.turns:
-            ends.add(after, decision.limited)
-            if watch.gated and expected is not None and not (watch.blind or watch.slid):
-                off = torch.linalg.vector_norm((increment - expected.increment)[-3:])
-                ends.leapt(float(off), verdict.note)
-            halt = halt or watch.way(ends.errors, decision, moved)
         note = "; ".join(filter(None, (stopped, verdict.note)))
         return Step(seen, decision, after, increment, pull, report, seconds, note), halt
 
@@ -312,41 +303,3 @@ class ClosedLoop:
         watch = OnTheWay(self.safety.guards, self.controller.focus, seen, decision)
         after = self.plant.send_path(path, watch, seen, "turn" if decision.turns else "grip")
         return after, watch.why
-
-    def _learn(
-        self,
-        seen: Observation,
-        decision: Decision,
-        after: Observation,
-        moved: Tensor,
-        verdict: Verdict,
-        goes_on: bool,
-    ) -> UpdateReport | None:
-        """What a movement teaches, and whether the object slides."""
-        controller, knowledge, expected = self.controller, self.knowledge, verdict.expected
-        if controller.enhanced is None or expected is None:
-            return None
-        if not knowledge.servo.learns:  # then the dead zones are g's to learn
-            moved = decision.delta_a
-            expected = controller.expect(decision.pieces, self._figures.pulled(moved))
-        increment = after.state.minus(seen.state)
-        if decision.turns:
-            off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
-            if float(off.norm()) > _SLIPS * (2**0.5 * NOISE + _SHARE * float(way.norm())):
-                controller.tighter += _SLIP
-            if self.learn and seen.status is PlantStatus.HELD:  # both ends were measured
-                knowledge.error.see(off, way)
-        if not (verdict.teaches and goes_on and self.learn):
-            return None
-        least = controller.kinematic.options.forces.normal_std
-        surprise = felt(controller.kinematic.hand, least, expected, seen, after)
-        if surprise is not None:
-            learn_forces(controller.kinematic.hand, knowledge, expected, surprise)
-        return learn(controller, self._figures, expected, moved, increment)
-
-    def _forces_there(self, seen: Observation, decision: Decision) -> tuple[Linearization, Tensor] | None:
-        """The last linearization on the way, for the forces that go on from it."""
-        last = decision.pieces[-1]
-        if not last.linearization.forces.solved:
-            return self.controller.previous
-        return last.linearization, seen.a + decision.delta_a - last.action

@@ -16,7 +16,7 @@ from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, S
 from ..kinematics import GraspState
 from ..model import KinematicModel, ModelStatus
 from ..typing import Float, Tensor
-from .decision import Decision, Expectation, Grip, Piece, StopReason
+from .decision import Decision, Expectation, Grip, Piece, StopReason, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
 from .limiting import LimitingFunction, StepBound, contact_travel
 from .limits import ActuatorLimit, JointLimit, KeepsForce, Limit, NormalForceLimit
@@ -122,12 +122,11 @@ class LookAndMoveController:
         What they did otherwise is spread over the pieces as their ways are.
         """
         pieces = _made(pieces, moved)
-        way = torch.stack([one.action.norm() for one in pieces])
-        share = way / way.sum() if bool(way.any()) else way + 1 / len(pieces)
         extra = moved - sum(one.action for one in pieces)
         start = f = both = pieces[0].state
         deviation, made, last = torch.zeros_like(pieces[0].nominal), [], pieces[-1]
-        for one, part in zip(pieces, (share[:, None] * extra).unbind(), strict=True):
+        for one, share in zip(pieces, shares(pieces), strict=True):
+            part = share * extra
             w, g = one.action + part, torch.zeros_like(one.nominal)
             nominal = one.nominal + one.linearization.manipulation_jacobian @ part
             if self.enhanced is not None:
@@ -143,6 +142,12 @@ class LookAndMoveController:
             rows, pads = self.kinematic.hand.pad_rows(last.linearization.contacts.finger)
             normal[pads] += (last.linearization.normal_force_sensitivity @ extra)[rows]
         return Expectation(moved, nominal, increment, deviation, tuple(made), normal)
+
+    def went(self, a: Float[Tensor, " n_a"], pieces: Sequence[Piece]) -> None:
+        """Forces go on from the last piece of a movement that began at encoders a [rad]."""
+        last, before = pieces[-1].linearization, sum(one.action for one in pieces[:-1])
+        if last.forces.solved:
+            self.previous = last, a + before
 
     def linearize(
         self, state: GraspState, a: Float[Tensor, " n_a"], fingertip_force: Float[Tensor, " n_pads"] | None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, NamedTuple
@@ -166,6 +167,17 @@ class Expectation(NamedTuple):
     """Force of each pad after it [N]; NaN of one that does not touch; None: unknown."""
 
     @property
+    def shares(self) -> list[float]:
+        """Of the way, that each piece is."""
+        return shares(self.pieces)
+
+    @property
     def described(self) -> Float[Tensor, " n_s"]:
         """By the hand as described, to first order [rad, m, rad]."""
         return torch.stack([one.linearization.described_jacobian @ one.action for one in self.pieces]).sum(0)
+
+
+def shares(pieces: Sequence[Piece]) -> list[float]:
+    """Of the way of the tendons, that each piece is."""
+    way = torch.stack([one.action.norm() for one in pieces])
+    return (way / way.sum()).tolist() if bool(way.any()) else [1 / len(pieces)] * len(pieces)

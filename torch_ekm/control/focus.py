@@ -99,7 +99,7 @@ class Direction:
     tolerance: float | None = None
     """None: 0.25 deg or 0.2 mm."""
     step: float | None = None
-    """Largest of a motion at pace 1; None: 2.5 deg or 2 mm."""
+    """Largest of a step; None: 2.5 deg or 2 mm."""
     weight: float = 1.0
     """Of what a step leaves unmet, relative to the other directions."""
 

@@ -45,6 +45,9 @@ class HandKnowledge(Recorded, nn.Module):
         figures: springs, moment arms, stiffnesses, and play of the drives.
     """
 
+    figures: HandFigures | DescribedFigures
+    error: ModelError
+
     def __init__(
         self,
         servo: ServoModel | IdealServos,
@@ -106,6 +109,7 @@ class HandKnowledge(Recorded, nn.Module):
         Raises:
             StateMismatchError: the state is of another hand, or holds NaN. Nothing was changed.
         """
+        state_dict = _of_now(state_dict)
         if strict:
             check_state(self, state_dict)
         self._before.clear()
@@ -145,7 +149,7 @@ class HandKnowledge(Recorded, nn.Module):
         """
         try:
             described, state = read(path)
-            made = rebuild(path, described, state, known_classes())
+            made = rebuild(path, described, _of_now(state), known_classes())
             if not isinstance(made, cls):
                 raise FileFormatError(path, f"holds a {type(made).__name__}, no {cls.__name__}")
             return made
@@ -154,6 +158,12 @@ class HandKnowledge(Recorded, nn.Module):
             if previous(path).is_file():
                 problem += f"; the last file that was good is {previous(path)}: copy it here to go on with it"
             raise FileFormatError(path, problem) from None
+
+
+def _of_now(state: Mapping[str, Any]) -> dict[str, Any]:
+    """Files of version 0.3 have a pace in place of the error of the model."""
+    kept = {name: value for name, value in state.items() if name != "pace"}
+    return kept if len(kept) == len(state) else {**kept, "error.square": ModelError().square}
 
 
 def previous(path: str | os.PathLike) -> Path:

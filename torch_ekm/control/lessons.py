@@ -1,4 +1,4 @@
-"""What a movement teaches: forces, figures of the hand, g."""
+"""What a movement teaches: how far the model errs, how forces answer, figures of the hand, g."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
+from .._noise import NOISE
 from ..plant import Observation
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
-from .decision import Expectation
+from .decision import Decision, Expectation
 
 if TYPE_CHECKING:
     from ..description import HandDescription
@@ -17,11 +18,9 @@ if TYPE_CHECKING:
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
 
-_NOISE, _OF_IT, _SURPRISES = (
-    0.5,
-    0.25,
-    1.6,
-)  # [N]; share of what a finger bears; deviations that are a surprise
+_SLIP = 0.5  # [N] by which the grip is tightened where the object moved otherwise than predicted:
+_SLIPS, _OF_WAY = 3.0, 0.3  # noises, and share of the way, from which it is thought to slide
+_OF_IT, _WRONG = 0.25, 3.0  # share of what a finger bears that is no surprise; deviations that are one
 
 
 class ForceSurprise(NamedTuple):
@@ -38,75 +37,96 @@ class ForceSurprise(NamedTuple):
     def wrong(self, before: Observation) -> bool:
         """Some pad measured what was not predicted, or has let go."""
         assert before.fingertip_force is not None
-        noise = (_NOISE**2 + (_OF_IT * before.fingertip_force[list(self.pads)]).square()).sqrt()
-        return bool((self.surprise.abs() > _SURPRISES * noise).any() or self.gone.any())
+        noise = (NOISE.force**2 + (_OF_IT * before.fingertip_force[list(self.pads)]).square()).sqrt()
+        return bool((self.surprise.abs() > _WRONG * noise).any() or self.gone.any())
 
 
 def felt(
-    hand: HandDescription, least: float, expected: Expectation, before: Observation, after: Observation
+    hand: HandDescription, expected: Expectation, before: Observation, after: Observation
 ) -> ForceSurprise | None:
-    """Of a movement; None: no pad measures.
-
-    Args:
-        least: a pad that reads less may be dead [N].
-    """
+    """Of a movement; None: no pad measures."""
     if before.fingertip_force is None or after.fingertip_force is None or expected.normal is None:
         return None
     _, pads = hand.pad_rows(expected.pieces[0].linearization.contacts.finger)
     was, now = before.fingertip_force[pads], after.fingertip_force[pads]
-    touched, touches = was >= least, now >= least
-    surprise = (now - expected.normal[pads]).where(touched & touches, torch.nan)
-    return ForceSurprise(
-        tuple(pads), (now - was).where(touched & touches, torch.nan), surprise, touched & ~touches
-    )
+    touched, touches = was >= NOISE.pressing, now >= NOISE.pressing  # one that reads less may be dead
+    both, nothing = touched & touches, now.new_full((), torch.nan)
+    surprise = (now - expected.normal[pads]).where(both, nothing)
+    return ForceSurprise(tuple(pads), (now - was).where(both, nothing), surprise, touched & ~touches)
 
 
-def learn_forces(
-    hand: HandDescription, knowledge: HandKnowledge, expected: Expectation, felt: ForceSurprise
-) -> None:
-    """Pads that touched and measured before and after a movement teach how their forces answer."""
-    change = torch.full_like(knowledge.forces.drift, torch.nan)
-    change[list(felt.pads)] = felt.change
-    described, names = (
-        torch.zeros_like(knowledge.forces.correction),
-        expected.pieces[0].linearization.contacts.finger,
-    )
-    rows, _ = hand.pad_rows(names)
-    way = torch.stack([one.action.norm() for one in expected.pieces])
-    for one, share in zip(expected.pieces, (way / way.sum().clamp(min=1e-12)).tolist(), strict=True):
-        lin = one.linearization
-        if lin.contacts.finger == names:
-            described[list(felt.pads)] += share * lin.described_normal_sensitivity[rows]
-    knowledge.forces.update(expected.moved, change, described)
-
-
-def learn(
-    controller: LookAndMoveController,
-    figures: HandFigures | DescribedFigures,
-    expected: Expectation,
-    moved: Float[Tensor, " n_a"],
-    increment: Float[Tensor, " n_s"],
-) -> UpdateReport | None:
-    """Figures and g learn from a movement: g from its pieces one by one, each with its share of what was not
-    predicted.
+class Lessons:
+    """Of one loop.
 
     Args:
-        moved: by the encoders [rad].
-        increment: ds, as measured.
+        controller: its enhanced model learns, if it has one.
+        knowledge: of the hand, which learns with it.
+        figures: those of the knowledge, or of a hand as described.
     """
-    enhanced, model, report = controller.enhanced, controller.kinematic, None
-    if enhanced is None:
-        return None
-    off = increment - expected.nominal
-    path = [(one.linearization, one.action) for one in expected.pieces]
-    figures.learn_path(path, moved, off, expected.nominal)
-    rest = increment - expected.increment
-    way = torch.stack([one.action.norm() for one in expected.pieces])
-    done, shares = 0.0, (way / way.sum().clamp(min=1e-12)).tolist()
-    for one, share in zip(expected.pieces, shares, strict=True):
-        lin = one.linearization
-        nominal = one.nominal + model.followed(lin).step(one.action) - lin.step(one.action)
-        state = one.state if done == 0 else one.state.plus(done * rest)
-        report = enhanced.update(state, one.action, one.increment + share * rest, nominal)
-        done += share
-    return report
+
+    def __init__(
+        self,
+        controller: LookAndMoveController,
+        knowledge: HandKnowledge,
+        figures: HandFigures | DescribedFigures,
+    ) -> None:
+        self._controller, self._knowledge, self._figures = controller, knowledge, figures
+
+    def judge(self, decision: Decision, expected: Expectation, increment: Float[Tensor, " n_s"]) -> None:
+        """How far a movement ended from its prediction: the share of :class:`ModelError`, and a tighter grip
+        of an object that slides."""
+        off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
+        if decision.turns:
+            self._knowledge.error.see(off, way)
+            if float(off.norm()) > _SLIPS * NOISE.rotation + _OF_WAY * float(way.norm()):
+                self._controller.tighter += _SLIP
+
+    def learn(
+        self,
+        seen: Observation,
+        decision: Decision,
+        after: Observation,
+        moved: Float[Tensor, " n_a"],
+        expected: Expectation,
+    ) -> UpdateReport | None:
+        """Forces, figures and g learn; None: the controller has no learner.
+
+        Args:
+            moved: by the encoders [rad].
+            expected: of that.
+        """
+        controller = self._controller
+        if controller.enhanced is None:
+            return None
+        if not self._knowledge.servo.learns:  # then the dead zones are g's to learn
+            moved = decision.delta_a
+            expected = controller.expect(decision.pieces, self._figures.pulled(moved))
+        surprise = felt(controller.kinematic.hand, expected, seen, after)
+        if surprise is not None:
+            self._learn_forces(expected, surprise)
+        increment = after.state.minus(seen.state)
+        path = [(one.linearization, one.action) for one in expected.pieces]
+        self._figures.learn_path(path, moved, increment - expected.nominal, expected.nominal)
+        return self._learn_residual(expected, increment - expected.increment)
+
+    def _learn_residual(self, expected: Expectation, rest: Tensor) -> UpdateReport | None:
+        """g, piece by piece, each with its share of what was not predicted, of what the figures leave."""
+        enhanced, model, report, done = self._controller.enhanced, self._controller.kinematic, None, 0.0
+        assert enhanced is not None
+        for one, share in zip(expected.pieces, expected.shares, strict=True):
+            lin = one.linearization
+            nominal = one.nominal + model.followed(lin).step(one.action) - lin.step(one.action)
+            state = one.state.plus(done * rest) if done else one.state
+            report = enhanced.update(state, one.action, one.increment + share * rest, nominal)
+            done += share
+        return report
+
+    def _learn_forces(self, expected: Expectation, surprise: ForceSurprise) -> None:
+        forces, names = self._knowledge.forces, expected.pieces[0].linearization.contacts.finger
+        rows, pads = self._controller.kinematic.hand.pad_rows(names)
+        change, described = torch.full_like(forces.drift, torch.nan), torch.zeros_like(forces.correction)
+        change[pads] = surprise.change
+        for one, share in zip(expected.pieces, expected.shares, strict=True):
+            if one.linearization.contacts.finger == names:
+                described[pads] += share * one.linearization.described_normal_sensitivity[rows]
+        forces.update(expected.moved, change, described)

@@ -38,7 +38,7 @@ class KeepsForce(Protocol):
 class ActuatorLimit:
     """``a_min <= a + u <= a_max, |u| <= step``; some actuators do not move at all.
 
-    The step is a safety limit, not the one that sets the pace: where it cuts a motion short, the focused pose
+    The step is a safety limit and does not say how far to go: where it cuts a motion short, the focused pose
     is served at the expense of grip and off-axis motion.
     """
 

@@ -18,6 +18,8 @@ from .focus import FocusedPose, PoseTarget
 from .rehearsal import LONGEST, End, PathEnd, Rehearsal
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
 
@@ -62,6 +64,17 @@ class Plan:
     def errors(self) -> tuple[float, ...]:
         """Focused error there, as a turn [rad]."""
         return tuple(self.focus.error(self.target, state) for state in self.states)
+
+    def draw(self) -> Figure:
+        """Angle to go, rotation off the axis, friction and normal forces along the path, with bands of two
+        standard deviations; grey where it is not safe.
+
+        Raises:
+            MissingExtraError: matplotlib is not installed (extra ``plots``).
+        """
+        from .plan_figure import draw  # matplotlib is needed only here
+
+        return draw(self)
 
     def __str__(self) -> str:
         errors = [error / _DEG for error in self.errors]

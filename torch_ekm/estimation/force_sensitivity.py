@@ -18,6 +18,7 @@ from .update import update
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _LARGEST_STD = 20.0  # [N] of a change of force that c and B do not explain
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
+_USUAL = 1 / 0.45**2 - 1  # information on theta that hands have in common, on top of the prior's
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 _KEPT, _TAKEN = 0.5, 0.3  # of the drift before, of the last motion
@@ -85,6 +86,9 @@ class ForceSensitivity(Recorded, nn.Module):
     ) -> Float[Tensor, " n_pads"]:
         """``sqrt(u' P u + s^2)``: standard deviation of what is predicted for the change of each force [N].
 
+        P with theta ~ N(0, 0.45^2) before the first motion, as hands were found to be: the wider prior of the
+        estimate lets it follow a hand that is none of these.
+
         Args:
             moved: w [rad].
             said: S w, the change by the model alone [N].
@@ -92,8 +96,10 @@ class ForceSensitivity(Recorded, nn.Module):
         along = np.tile(_PRIOR_STD * moved.numpy(), (len(self.theta), 1))
         u = np.concatenate([said.numpy()[:, None], along], axis=-1)
         variance = self.variance.numpy()
-        doubt = ((_covariance(self.evidence.numpy(), variance) @ u[..., None])[..., 0] * u).sum(-1)
-        return torch.from_numpy(np.sqrt(variance + doubt))
+        known = _covariance(
+            self.evidence.numpy() + _USUAL * variance[:, None, None] * np.eye(u.shape[-1]), variance
+        )
+        return torch.from_numpy(np.sqrt(variance + ((known @ u[..., None])[..., 0] * u).sum(-1)))
 
     def begin(self) -> None:
         """A new grasp: nothing drifts yet."""

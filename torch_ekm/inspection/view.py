@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ..control import ClosedLoop, LookAndMoveController
+from ..control import ClosedLoop, LookAndMoveController, Reach
 from ..description import HandDescription, list_hands, load_hand, load_object
 from ..description.registry import HAND_FILES
 from ..exceptions import DescriptionError, ParameterError, UnknownNameError
@@ -113,12 +114,19 @@ def _reach(plant: SimulatedHand) -> View:
     back, forth = (loop.reach(sign=sign) for sign in (-1, 1))
     one, other = forth.plan.states, back.plan.states
     states = [*one, *reversed(one[:-1]), *other[1:], *reversed(other[:-1])]
-    rows = tuple(
-        (name, f"{math.degrees(reach.angle):.1f}", str(reach.end))
-        for name, reach in (("back", back), ("forth", forth))
-    )
-    header = ("direction", "angle [deg]", "ends by")
+    rows = tuple(row for name, end in (("back", back), ("forth", forth)) for row in _way(name, end))
+    header = ("direction", "angle [deg]", "off the axis [deg]", "ends by")
     return View(f"{plant.hand.name} turns {plant.object.name}", _scene(plant, states), header, rows)
+
+
+def _way(name: str, reach: Reach) -> Iterator[tuple[str, ...]]:
+    """Each waypoint with its band, and what ends the path."""
+    plan = reach.plan
+    asked = plan.errors[0]
+    for k, (one, left) in enumerate(zip(plan.waypoints, plan.errors[1:], strict=True), 1):
+        off, std = math.degrees(one.band.off), math.degrees(one.band.off_std)
+        last = str(reach.end) if k == len(plan.waypoints) else "" if k <= plan.safe else "not safe"
+        yield name, f"{math.degrees(asked - left):.1f}", f"{off:.1f} +- {std:.1f}", last
 
 
 def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool = False) -> View:

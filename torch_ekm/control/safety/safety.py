@@ -75,7 +75,7 @@ class Guards:
     """Limits of a :class:`~torch_ekm.control.ClosedLoop`, the same for every plant; SI units.
 
     A reading that breaks one is looked at again (``observe()``), ``looks`` times. If it stands, the loop ends
-    with a reason of its own, and what learns (learner, trust region, servo model) is as it was before the
+    with a reason of its own, and what learns (learner, figures, servo model) is as it was before the
     motion; where a sensor lied for several, before the manipulation. Two things are no end: a motion whose
     pose is unknown is blind, and the model predicts the pose; a fingertip at fault is left out, and the
     model's estimate stands in.

@@ -64,7 +64,7 @@ class Watch:
         tolerance: float = math.inf,
         servo: ServoModel | IdealServos | None = None,
     ) -> None:
-        self.guards, self.hand, self._least = guards, model.hand, model.options.forces.normal_std
+        self.guards, self.hand = guards, model.hand
         self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
         servo = IdealServos(model.hand.actuator_names) if servo is None else servo
         self.consistency = Consistency(self.readings, model, servo)
@@ -201,7 +201,7 @@ class Watch:
         """A pose that jumps is the object's where two looks agree and the grip has changed, too."""
         if expected is None or last is None or not agree(last, seen, self.guards):
             return ""
-        surprise = felt(self.hand, self._least, expected, before, seen)
+        surprise = felt(self.hand, expected, before, seen)
         if surprise is None or not surprise.wrong(before):
             return ""
         ds = (seen.state.minus(before.state) - expected.increment)[-6:]

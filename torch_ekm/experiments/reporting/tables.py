@@ -23,7 +23,7 @@ LEGEND = {
     "KM+I": "the same model with integral action: increments add up on the set-point; it learns nothing",
     "KM+S": "the same model on the servo inverse, which finds the dead zones of the motors on the encoders",
     "E-KM": "the same servo inverse; the model follows the figures of the hand, which it learns, and a "
-    "learner corrects it; its steps may be up to twice as large",
+    "learner corrects it; it plans whole turns, and goes as far at once as it is sure",
 }
 _MEANINGS = {
     StopReason.REACHED.value: "the measured error stays within the tolerance",
@@ -31,7 +31,7 @@ _MEANINGS = {
     StopReason.STEP_LIMIT.value: "all motions are used up",
     StopReason.ACTUATOR_LIMITS.value: "the motors that are needed are at the ends of their ranges",
     StopReason.UNSTABLE_GRASP.value: "the model predicts that the grasp buckles, or cannot be held",
-    StopReason.GIVEN_UP.value: "the grasp came too near to a loss, and the way back did not help",
+    StopReason.GIVEN_UP.value: "no way on was safe; the object is in the hand",
     StopReason.WEAK_GRASP.value: "declined: a finger bore less than the object needs",
     StopReason.OUT_OF_REACH.value: "declined before anything moved",
     StopReason.OBJECT_LOST.value: "the object was dropped, or turned too far off the axis",
@@ -89,8 +89,8 @@ def motion_table(trials: DataFrame) -> Table:
     note = (
         "Mean and 95 % bootstrap interval over pairs of object and seed. Beyond angle / step: motions until "
         f"the measured error stays within {BAND_DEG:g} deg, less the angle over {STEP_DEG:g} deg, rounded "
-        "up; below 0 where the pace is above 1. A turn that never settles counts with the limit. First "
-        "motion, all motions (that ask for 0.5 deg or more and do not go back): by how much more or less a "
+        "up; below 0 where one movement is longer. A turn that never settles counts with the limit. First "
+        "motion, all motions (that ask for 0.5 deg or more): by how much more or less a "
         "motion changed the error than it was to. Off the axis: rotation at the end, of objects that were "
         "not lost."
     )

@@ -17,7 +17,7 @@ from .statistics import DataFrame
 
 #: An error is settled when it stays within twice the default tolerance [deg].
 BAND_DEG = 0.5
-#: Rotation of one motion at pace 1 [deg].
+#: Largest step without a plan [deg].
 STEP_DEG = LimitingFunction().step / DEGREE
 
 #: What :func:`trial_frame` adds to the figures of a record; NaN where nothing was grasped.

@@ -1,0 +1,65 @@
+"""A plan as a picture."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from .._extras import require
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ..model import Linearization
+    from .plan import Plan
+
+_DEG = math.pi / 180
+_STYLE = "torch_ekm.style"
+_PANELS = "to go [deg]", "off the axis [deg]", "share of the friction left", "normal forces [N]"
+
+
+def draw(plan: Plan) -> Figure:
+    """See :meth:`~torch_ekm.control.Plan.draw`."""
+    with require("matplotlib.style").context(_STYLE):
+        # a Figure of its own: pyplot would keep it alive and touch the caller's backend
+        figure = require("matplotlib.figure").Figure(figsize=(8.0, 5.0), layout="constrained")
+        panels = figure.subplots(2, 2, sharex=True).ravel().tolist()
+    bands, row = [one.band for one in plan.waypoints], plan.focus.matrix[0]
+    stds = [float((row.square() * band.twist_std.square()).sum().sqrt()) / _DEG for band in bands]
+    _line(panels[0], [error / _DEG for error in plan.errors[1:]], stds)
+    _line(panels[1], [band.off / _DEG for band in bands], [band.off_std / _DEG for band in bands])
+    grasps = [one.piece.linearization for one in plan.waypoints]
+    left = [
+        dict(zip(lin.contacts.finger, lin.forces.relative_margin.tolist(), strict=True)) for lin in grasps
+    ]
+    for name in dict.fromkeys(name for one in left for name in one):
+        _line(panels[2], [one.get(name, math.nan) for one in left], label=name)
+    forces = [band.force for band in bands if band.force is not None]
+    spread = [band.force_std for band in bands if band.force_std is not None]
+    for pad in range(len(forces[0]) if forces else 0):
+        force, std = ([float(one[pad]) for one in known] for known in (forces, spread))
+        if not any(map(math.isnan, force)):
+            _line(panels[3], force, std)
+    for axes, label in zip(panels, _PANELS, strict=True):
+        axes.set_ylabel(label)
+        axes.axvspan(plan.safe + 0.5, max(len(bands), plan.safe) + 0.5, color="0.93", zorder=0)
+    panels[2].set_xlabel("waypoint")
+    panels[3].set_xlabel("waypoint")
+    if left:
+        panels[2].legend()
+    return figure
+
+
+def _margins(lin: Linearization) -> dict[str, float]:
+    return dict(zip(lin.contacts.finger, lin.forces.relative_margin.tolist(), strict=True))
+
+
+def _line(axes: Any, middle: Sequence[float], std: Sequence[float] | None = None, label: str = "") -> None:
+    """A prediction at each waypoint, within two standard deviations."""
+    at = range(1, len(middle) + 1)
+    (line,) = axes.plot(at, middle, label=label)
+    if std is not None:
+        pairs = list(zip(middle, std, strict=True))
+        low, high = [m - 2 * s for m, s in pairs], [m + 2 * s for m, s in pairs]
+        axes.fill_between(at, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
