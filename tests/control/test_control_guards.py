@@ -15,6 +15,7 @@ from torch_ekm.control import (
     Guards,
     HandKnowledge,
     LookAndMoveController,
+    OneStep,
     PoseTarget,
     Safety,
     StoppingRule,
@@ -38,7 +39,10 @@ class Run:
         controller = LookAndMoveController(self.ekm, axis)
         safety = SAFETY if guards is None else dataclasses.replace(SAFETY, guards=guards)
         self.loop = ClosedLoop(
-            self.plant if around is None else around(self.plant), controller, safety=safety
+            self.plant if around is None else around(self.plant),
+            controller,
+            safety=safety,
+            planner=OneStep(),  # small steps, whatever a planner makes of a hand that it knows
         )
         self.learned = [self.state()]
         target = PoseTarget.turned(seen.state, axis, degrees=angle)

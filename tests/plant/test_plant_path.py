@@ -152,6 +152,13 @@ def test_a_plant_that_cannot_follow_gets_few_single_commands() -> None:
     assert len(passed) == 2
 
 
+def test_motors_that_go_another_way_get_no_further_commands() -> None:
+    plant = Hand()
+    plant.move = lambda delta_a: Hand.move(plant, -delta_a)
+    after = Gate(plant, HAND).follow(Path.through(degrees((15, 0, 0), (30, 0, 0), (45, 0, 0)), 1.0), always)
+    torch.testing.assert_close(after.a, degrees((-15, 0, 0))[0])
+
+
 @pytest.mark.parametrize("plant", [Follower(1 * DEG), Hand()])
 def test_dead_zones_are_made_up_for_in_the_direction_of_each_motor(plant) -> None:
     """There and back: the set-point jumps by two dead zones where a motor turns round."""
