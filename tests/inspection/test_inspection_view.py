@@ -65,10 +65,11 @@ def test_a_grasp_says_what_each_actuator_does() -> None:
 
 
 def test_the_reach_goes_to_both_ends_and_home() -> None:
-    seen = view("icub_right", "tea_tin", reach=True)
-    back, forth = seen.rows
-    assert float(back[1]) < 0 < float(forth[1])
-    assert forth[2] == "friction: index, middle"
+    seen = view("planar_two_finger", "can", reach=True)
+    (*back, first), (*forth, last) = ([r for r in seen.rows if r[0] == name] for name in ("back", "forth"))
+    assert all(len(way) > 3 for way in (back, forth))  # waypoints with their bands
+    assert {row[3] for row in (*back, *forth)} == {"", "not safe"}
+    assert [end[3] for end in (first, last)] == ["actuator: left", "actuator: right"]
     np.testing.assert_allclose(seen.scene.transforms[0], seen.scene.transforms[-1])
     with pytest.raises(ParameterError, match="without an object"):
         view("icub_right", reach=True)
