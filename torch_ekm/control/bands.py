@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from .._noise import NOISE
 from ..estimation.hand_figures import HandFigures
 from ..kinematics import GraspState
 from ..typing import Array, Tensor
 from .decision import Band, Piece
-from .model_error import NOISE
+from .model_error import STEADY
 
 if TYPE_CHECKING:
     from ..plant import Observation
@@ -83,14 +84,16 @@ class Bands:
         self._force = piece.force
         force = torch.full_like(piece.force, torch.nan)
         force[self._pads] = piece.force.nan_to_num()[self._pads]
-        spread = self._knowledge.forces.spread(self._pull, self._said)
+        spread = torch.full_like(force, NOISE.force)
+        if self._controller.forces is not None:  # else nothing is learned of them
+            spread = self._knowledge.forces.spread(self._pull, self._said)
         return force, (spread.square() + (_SHARE * self._swing).square()).sqrt()
 
     def _of_model(self) -> Array:
         """Covariance of what neither figures nor g know: shares of the way, and noise."""
         error, size = self._knowledge.error, float(np.linalg.norm(self._way))
         axis = self._way / max(size, 1e-12)
-        turn = (error.across * size) ** 2 * np.eye(3) + NOISE**2 * np.eye(3)
+        turn = (error.across * size) ** 2 * np.eye(3) + STEADY**2 * np.eye(3)
         turn += (error.along**2 - error.across**2) * size**2 * np.outer(axis, axis)
-        shift = (_LEVER * error.across * size) ** 2 * np.eye(3) + (_LEVER * NOISE) ** 2 * np.eye(3)
+        shift = (_LEVER * error.across * size) ** 2 * np.eye(3) + (_LEVER * STEADY) ** 2 * np.eye(3)
         return np.block([[shift, np.zeros((3, 3))], [np.zeros((3, 3)), turn]])

@@ -300,6 +300,6 @@ class ClosedLoop:
         path = Path.through(
             torch.stack([self._figures.motors(way) for way in ways]), self.safety.guards.speed
         )
-        watch = OnTheWay(self.safety.guards, self.controller.focus, seen, decision)
+        watch = OnTheWay(self.safety.guards, seen, decision)
         after = self.plant.send_path(path, watch, seen, "turn" if decision.turns else "grip")
         return after, watch.why

@@ -15,7 +15,7 @@ from ..typing import Float, Tensor
 _START = 0.1, 0.2  # along and across, of a hand of which nothing is known
 _RECENT = 0.25  # weight of the last motion,
 _WHOLE = math.radians(2.5)  # if it is as long as this [rad]
-NOISE = math.radians(0.4)  # [rad] of a motion as measured: two poses, and a pad that creeps as it settles
+STEADY = math.radians(0.4)  # [rad] of a motion as measured: two poses, and a pad that creeps as it settles
 
 
 class ModelError(Recorded, nn.Module):
@@ -59,7 +59,7 @@ class ModelError(Recorded, nn.Module):
         along = float(error @ way) / size
         across = max(float(error @ error) - along**2, 0.0) / 2  # of each of two directions
         found = self.square.new_tensor([along**2, across])
-        share = ((found - NOISE**2) / size**2).clamp(0, 1)
+        share = ((found - STEADY**2) / size**2).clamp(0, 1)
         self.square += _RECENT * min(1.0, (size / _WHOLE) ** 2) * (share - self.square)
 
     def state_problems(self, state: Mapping[str, Any]) -> list[str]:

@@ -74,7 +74,10 @@ class Plan:
         """
         from .plan_figure import draw  # matplotlib is needed only here
 
-        return draw(self)
+        bands, row = [one.band for one in self.waypoints], self.focus.matrix[0]
+        stds = [float((row.square() * band.twist_std.square()).sum().sqrt()) for band in bands]
+        grasps = [one.piece.linearization for one in self.waypoints]
+        return draw(self.errors[1:], stds, bands, grasps, self.safe)
 
     def __str__(self) -> str:
         errors = [error / _DEG for error in self.errors]

@@ -12,27 +12,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ..model import Linearization
-    from .plan import Plan
+    from .decision import Band
 
 _DEG = math.pi / 180
 _STYLE = "torch_ekm.style"
 _PANELS = "to go [deg]", "off the axis [deg]", "share of the friction left", "normal forces [N]"
 
 
-def draw(plan: Plan) -> Figure:
-    """See :meth:`~torch_ekm.control.Plan.draw`."""
+def draw(
+    errors: Sequence[float],
+    stds: Sequence[float],
+    bands: Sequence[Band],
+    grasps: Sequence[Linearization],
+    safe: int,
+) -> Figure:
+    """See :meth:`~torch_ekm.control.Plan.draw`.
+
+    Args:
+        errors, stds: focused error at each waypoint, and its deviation [rad].
+        bands: there.
+        grasps: where the pieces begin.
+        safe: waypoints that may be passed.
+    """
     with require("matplotlib.style").context(_STYLE):
         # a Figure of its own: pyplot would keep it alive and touch the caller's backend
         figure = require("matplotlib.figure").Figure(figsize=(8.0, 5.0), layout="constrained")
         panels = figure.subplots(2, 2, sharex=True).ravel().tolist()
-    bands, row = [one.band for one in plan.waypoints], plan.focus.matrix[0]
-    stds = [float((row.square() * band.twist_std.square()).sum().sqrt()) / _DEG for band in bands]
-    _line(panels[0], [error / _DEG for error in plan.errors[1:]], stds)
+    _line(panels[0], [error / _DEG for error in errors], [std / _DEG for std in stds])
     _line(panels[1], [band.off / _DEG for band in bands], [band.off_std / _DEG for band in bands])
-    grasps = [one.piece.linearization for one in plan.waypoints]
-    left = [
-        dict(zip(lin.contacts.finger, lin.forces.relative_margin.tolist(), strict=True)) for lin in grasps
-    ]
+    left = [_margins(lin) for lin in grasps]
     for name in dict.fromkeys(name for one in left for name in one):
         _line(panels[2], [one.get(name, math.nan) for one in left], label=name)
     forces = [band.force for band in bands if band.force is not None]
@@ -43,7 +51,7 @@ def draw(plan: Plan) -> Figure:
             _line(panels[3], force, std)
     for axes, label in zip(panels, _PANELS, strict=True):
         axes.set_ylabel(label)
-        axes.axvspan(plan.safe + 0.5, max(len(bands), plan.safe) + 0.5, color="0.93", zorder=0)
+        axes.axvspan(safe + 0.5, max(len(bands), safe) + 0.5, color="0.93", zorder=0)
     panels[2].set_xlabel("waypoint")
     panels[3].set_xlabel("waypoint")
     if left:

@@ -13,7 +13,6 @@ from .safety import Guards
 
 if TYPE_CHECKING:
     from ..decision import Decision
-    from ..focus import FocusedPose
 
 _DEVIATIONS = 4.0
 _RUNNING = 2  # frames that leave the band: one may be a wrong picture
@@ -23,18 +22,17 @@ _SWINGS = math.radians(1.0)  # [rad] by which a moving object lags behind its eq
 class OnTheWay:
     """Whether a movement goes on: no finger presses too hard, the object is held, and near its path.
 
-    The rotation off the focus in a picture is held against that of the path where the encoders were when it
-    was taken, and against the band at the end of the movement.
+    The object's rotation in a picture is held against that of the path where the encoders were when it was
+    taken, and against the band at the end of the movement.
 
     Args:
         guards: limits.
-        focus: what counts as off.
         seen: where the movement begins.
         decision: the movement.
     """
 
-    def __init__(self, guards: Guards, focus: FocusedPose, seen: Observation, decision: Decision) -> None:
-        self._guards, self._focus, self._seen, self._band = guards, focus, seen, decision.band
+    def __init__(self, guards: Guards, seen: Observation, decision: Decision) -> None:
+        self._guards, self._seen, self._band = guards, seen, decision.band
         self._ends = torch.stack([one.action for one in decision.pieces]).cumsum(0)
         self._twists = torch.stack([one.increment[-6:] for one in decision.pieces]).cumsum(0)
         self._frames = [(seen.taken.encoders, seen.a)]
@@ -51,15 +49,16 @@ class OnTheWay:
         elif force is not None and bool((force > self._guards.force_ceiling).any()):
             self.why = f"a finger presses with {float(force.max()):.1f} N"
         elif self._band is not None and seen.status is PlantStatus.HELD:
-            off = self._off_path(seen)
-            most = _DEVIATIONS * self._band.off_std + _SWINGS
+            turn = self._off_path(seen)[-3:]
+            off = float(turn.norm())
+            most = _DEVIATIONS * max(self._band.off_std, float(self._band.twist_std[-3:].max())) + _SWINGS
             self._off = self._off + 1 if off > most else 0
             if self._off >= _RUNNING:
                 self.why = f"the object is {math.degrees(off):.1f} deg off its path"
         return not self.why
 
-    def _off_path(self, seen: Observation) -> float:
-        """Rotation off the focus that the path does not have where the picture was taken [rad]."""
+    def _off_path(self, seen: Observation) -> Tensor:
+        """Twist of the object that the path does not have where the picture was taken [m, rad]."""
         moved = self._encoders(seen.taken.pose) - self._seen.a
         end = self._ends[-1]
         done = min(max(float(moved @ end) / max(float(end @ end), 1e-12), 0.0), 1.0)
@@ -69,7 +68,7 @@ class OnTheWay:
         start = float(way[k - 1]) if k else 0.0
         share = (done - start) / max(float(way[k]) - start, 1e-9)
         planned = before + min(max(share, 0.0), 1.0) * (self._twists[k] - before)
-        return self._focus.off_rotation(seen.state.minus(self._seen.state)[-6:] - planned)
+        return seen.state.minus(self._seen.state)[-6:] - planned
 
     def _encoders(self, time: float) -> Tensor:
         """Where they were, between two readings."""
