@@ -214,8 +214,7 @@ class Comparison:
 
         found = {name: [Movements(tuple(self.of(name, p))) for p in self.plants] for name in self.names}
         rows = [[name, *map(cell, turns)] for name, turns in found.items()]
-        title = "Each hand: lost, reached, mean of turning movements and of seconds"
-        return Table("plants", title, ["contender", *self.plants], rows)
+        return Table("plants", "Lost, reached, turning movements, time", ["contender", *self.plants], rows)
 
     def calibration(self) -> Table:
         """How much the stated 90 % intervals hold."""
