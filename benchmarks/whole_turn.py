@@ -22,7 +22,7 @@ from any_hand import OTHERS, Turns, records_by
 from command_line import study_parser
 
 from torch_ekm._terminal import progress
-from torch_ekm.control import ClosedLoop, Decision, Manipulation, OneStep, WholeTurn
+from torch_ekm.control import ClosedLoop, Manipulation, OneStep, WholeTurn
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.records import TrialRecord, true_state
@@ -30,7 +30,6 @@ from torch_ekm.experiments.reporting.plots import new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.experiments.reporting.statistics import Rate, rate
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.plant import Observation
 from torch_ekm.simulation import PlantParameters, preset
 from torch_ekm.typing import Float, Tensor
 
@@ -53,8 +52,10 @@ PLANTS: dict[str, PlantParameters] = {
 class UnwatchedLoop(ClosedLoop):
     """Readings on the way end no movement."""
 
-    def _command(self, seen: Observation, decision: Decision) -> tuple[Observation, str]:
-        return self.plant.send(decision.delta_a, seen, "turn" if decision.turns else "grip"), ""
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        send = self.plant.send_path
+        self.plant.send_path = lambda path, watch, *rest: send(path, lambda seen: True, *rest)
 
 
 class UnwatchedBench(Bench):
@@ -207,14 +208,13 @@ class Comparison:
 
     def by_plant(self) -> Table:
         """Lost, reached, turning movements and seconds on each plant."""
-        rows: list[list[Cell]] = []
-        for name in self.names:
-            found = [Movements(tuple(self.of(name, plant))) for plant in self.plants]
-            means = (f"{one.of('turning'):.1f}, {one.of('simulated_s'):.1f} s" for one in found)
-            ends = (f"{one.lost}, {one.reached}" for one in found)
-            rows.append([name, *map(", ".join, zip(ends, means, strict=True))])
-        note = "Lost, reached, mean turning movements and seconds."
-        return Table("plants", "Each hand", ["contender", *self.plants], rows, note)
+
+        def cell(one: Movements) -> str:
+            return f"{one.lost}, {one.reached}, {one.of('turning'):.1f}, {one.of('simulated_s'):.1f} s"
+
+        found = {name: [Movements(tuple(self.of(name, p))) for p in self.plants] for name in self.names}
+        rows = [[name, *map(cell, turns)] for name, turns in found.items()]
+        return Table("plants", "Lost, reached, turning movements, time", ["contender", *self.plants], rows)
 
     def calibration(self) -> Table:
         """How much the stated 90 % intervals hold."""

@@ -13,6 +13,7 @@ pytest.importorskip("whole_turn", reason="the benchmarks are not part of this in
 import whole_turn
 from whole_turn import CONTENDERS, VARIANTS, Comparison, Turn
 
+from torch_ekm.control.safety.on_the_way import OnTheWay
 from torch_ekm.experiments.config import Setting
 
 BANDS = ([1, 0.5, 0.2, [0.1, -2.0]], [6, -1.7, 0.1, []])
@@ -83,9 +84,11 @@ def test_movements_of_a_loop_without_watch_go_to_their_end(tmp_path: Path, monke
     monkeypatch.setattr(whole_turn, "LEARNS_BY", (6.0,))
     monkeypatch.setattr(whole_turn, "ANGLES", (7.0,))
     asked = []
-    begin = whole_turn.ClosedLoop._command
-    monkeypatch.setattr(whole_turn.ClosedLoop, "_command", lambda *a: asked.append(a) or begin(*a))
-    words = ["--quick", "--variants", "--contenders", "no watch on the way", "--plants", "nominal"]
-    whole_turn.main([*words, "--jobs", "1", "--out", str(tmp_path)])
-    assert not asked
+    watch = OnTheWay.__call__
+    monkeypatch.setattr(OnTheWay, "__call__", lambda *given: asked.append(1) or watch(*given))
+    for name, watched in (("as it is", True), ("no watch on the way", False)):
+        asked.clear()
+        words = ["--quick", "--variants", "--contenders", name, "--plants", "nominal"]
+        whole_turn.main([*words, "--jobs", "1", "--out", str(tmp_path)])
+        assert bool(asked) == watched
     assert math.isfinite(float(capsys.readouterr().out.rsplit("seconds", 1)[1]))
