@@ -144,6 +144,13 @@ class Host(DoubleStateLearner):
         """
         return next((part for part in self._parts if isinstance(part, kind)), None)
 
+    parts: nn.ModuleList
+    """All of them, in the order in which they act."""
+
+    @abstractmethod
+    def count_sample(self, *, anew: bool = False) -> None:
+        """After a sample and all notes of it: rebuild the caches when it is time, or at once."""
+
     def is_due(self, n: int) -> bool:
         """Whether parts may change the state, and the caches are rebuilt, after n samples."""
         return n >= self.refresh_every and (n - self.refresh_offset) % self.refresh_every == 0
