@@ -9,9 +9,11 @@ import torch
 from torch.distributions import StudentT
 
 from ..typing import Tensor
+from . import mixture_plan as G
 from .report import UpdateReport
 from .sparse_gp import plan as P
-from .sparse_gp.engine.compiled import Bound, CompiledEngine, Plan, is_plain_one, on_array
+from .sparse_gp.engine.binding import Bound, Plan
+from .sparse_gp.engine.compiled import CompiledEngine, is_plain_one, on_array
 from .sparse_gp.engine.loading import load_loops
 
 
@@ -142,27 +144,26 @@ class CompiledMixture:
         return self._bound if self._bound.usable else None
 
     def _bind(self, g: Any) -> Bound:
-        loops: Any = load_loops()
         bound, tails = Bound(), g.tails
         at_zero = StudentT(tails.freedoms).log_prob(torch.zeros_like(tails.freedoms))
         fields = {
-            P.LARGEST: g.largest, loops.EXPERTS: g._experts, loops.PRIOR: g.prior, loops.EVIDENCE: g.evidence,
-            loops.INNOVATION: g.innovation, loops.LEVEL: g.level, loops.TREND: g.trend, loops.GAIN: g.gain,
-            loops.MASS: g.mass, loops.SHIFT: g.shift, loops.SPREAD: g.spread, loops.OFFSET: g.offset,
-            loops.INFLATION: g.inflation, loops.COUNT: g.count, loops.RATES: tails.rates,
-            loops.FREEDOMS: tails.freedoms, loops.TAIL_SCALE: tails.log_scale,
-            loops.TAIL_EVIDENCE: tails.evidence,
+            P.LARGEST: g.largest, G.EXPERTS: g._experts, G.PRIOR: g.prior, G.EVIDENCE: g.evidence,
+            G.INNOVATION: g.innovation, G.LEVEL: g.level, G.TREND: g.trend, G.GAIN: g.gain,
+            G.MASS: g.mass, G.SHIFT: g.shift, G.SPREAD: g.spread, G.OFFSET: g.offset,
+            G.INFLATION: g.inflation, G.COUNT: g.count, G.RATES: tails.rates,
+            G.FREEDOMS: tails.freedoms, G.TAIL_SCALE: tails.log_scale,
+            G.TAIL_EVIDENCE: tails.evidence,
         }  # fmt: skip
         bound.watch((g, tails), g._modules, g.learners._modules)
         bound.usable = all(
             t.is_cpu and t.is_contiguous() and t.dtype == torch.float64 for t in fields.values()
         )
-        row = bound.row = np.zeros(loops.FIELDS, np.int64)
+        row = bound.row = np.zeros(G.FIELDS, np.int64)
         for field, tensor in fields.items():
             row[field] = tensor.data_ptr()
         row[P.MODELS], row[P.IN], row[P.OUT] = g.batch_shape.numel(), g.in_features, g.out_features
-        row[loops.N_EXPERTS], row[loops.N_SHARES] = g.evidence.shape[-1], g.mass.shape[-1]
-        row[loops.N_TAILS], row[loops.AT_ZERO] = len(tails.rates), bound.own(at_zero.numpy().copy())
+        row[G.N_EXPERTS], row[G.N_SHARES] = g.evidence.shape[-1], g.mass.shape[-1]
+        row[G.N_TAILS], row[G.AT_ZERO] = len(tails.rates), bound.own(at_zero.numpy().copy())
         bound.all = np.ones(row[P.MODELS], np.bool_)
         return bound
 

@@ -14,7 +14,7 @@ from ...base import FARTHEST
 from ...misled import MISLED_RATE, WORSE
 from .. import plan as P
 from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, Z90_SQUARED
-from .numba_kernels import absorb, kernel_row, kernel_slopes, network, network_slopes, times
+from .numba_kernels import absorb, kernel_row, kernel_slopes, times
 from .numba_math import (
     A1,
     A2,
@@ -30,6 +30,7 @@ from .numba_math import (
     stack_at,
     vector_at,
 )
+from .numba_network import network, network_slopes
 
 
 @njit(INT(I1), **INNER)

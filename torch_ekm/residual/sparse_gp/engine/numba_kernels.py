@@ -1,4 +1,4 @@
-"""The recursion of a sparse GP, its kernels and a deep kernel's network as compiled loops for one model.
+"""The recursion of a sparse GP, and its kernels, as compiled loops for one model.
 
 Equations and names are those of :mod:`~torch_ekm.residual.sparse_gp.engine.recursion`,
 :mod:`~torch_ekm.residual.kernels` and :mod:`~torch_ekm.residual.sparse_gp.posterior`, which stay the
@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit, types
 
 from ..monitor import DISTRUSTED, DISTRUSTED_MOST, RATE
-from .numba_math import A1, A2, A3, EPS, I1, INNER, INT, TINY, F, exp, matrix_at, vector_at
+from .numba_math import A1, A2, A3, EPS, I1, INNER, INT, TINY, F, exp
 from .recursion import TIE, TIE_KL
 
 #: what a kernel's ``kind`` means
@@ -117,64 +117,6 @@ def kernel_slopes(n_a, z, basis, psi, phi, log_lengthscale, log_action, left, ou
     for r in range(rows):
         for j in range(u.shape[0]):
             out[r, j] *= u[j]
-
-
-@njit(types.void(I1, I1, INT, A1), **INNER)
-def network(widths, weights, own, values):
-    """A deep kernel's ``net(z)`` at the end of ``values``, which begins with z and holds each layer.
-
-    Args:
-        widths: of the layers, the input's first.
-        weights: addresses of weights and biases, layer by layer, of one model after the other's.
-        own: which model's.
-    """
-    at, layers = 0, widths.shape[0] - 1
-    for layer in range(layers):
-        n_in, n_out, last = widths[layer], widths[layer + 1], layer == layers - 1
-        W = matrix_at(weights[2 * layer], own, n_in, n_out)
-        new, old = values[at + n_in : at + n_in + n_out], values[at : at + n_in]
-        for j in range(n_out):
-            new[j] = 0.0
-        if not last:
-            bias = vector_at(weights[2 * layer + 1], own, n_out)
-            for j in range(n_out):
-                new[j] = bias[j]
-        for i in range(n_in):
-            a, by = old[i], W[i]
-            for j in range(n_out):
-                new[j] += a * by[j]
-        if not last:
-            for j in range(n_out):
-                new[j] = 1.0 - 2.0 / (exp(2.0 * new[j]) + 1.0)  # tanh
-        at += n_in
-
-
-@njit(types.void(I1, I1, INT, A1, A2, A2), **INNER)
-def network_slopes(widths, weights, own, values, by, out):
-    """``out += by dnet/dz``, from the features back: ``by (rows, features)``."""
-    layers, widest = widths.shape[0] - 1, 0
-    for layer in range(layers + 1):
-        widest = max(widest, widths[layer])
-    at, both = values.shape[0] - widths[layers], np.empty((2, widest))
-    for r in range(by.shape[0]):
-        now, begin = 0, at
-        for j in range(widths[layers]):
-            both[0, j] = by[r, j]
-        for layer in range(layers - 1, -1, -1):
-            n_in, n_out = widths[layer], widths[layer + 1]
-            W, old, new = matrix_at(weights[2 * layer], own, n_in, n_out), both[now], both[1 - now]
-            begin -= n_in
-            for i in range(n_in):
-                total, line = 0.0, W[i]
-                for j in range(n_out):
-                    total += line[j] * old[j]
-                new[i] = total
-            if layer > 0:
-                for i in range(n_in):
-                    new[i] *= 1.0 - values[begin + i] * values[begin + i]
-            now = 1 - now
-        for j in range(widths[0]):
-            out[r, j] += both[now, j]
 
 
 @njit(types.void(A2, A1, A1), **INNER)
