@@ -81,7 +81,7 @@ class LearnHyperparameters(Part):
         self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
-        parameters = [*learner.kernel.parameters(), learner.log_noise_variance]
+        parameters = [*learner.kernel.hyperparameters().values(), learner.log_noise_variance]
         self.adam = Adam(parameters, betas=(0.9, 0.99))
         for i, p in enumerate(parameters):
             self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
@@ -169,7 +169,7 @@ class LearnHyperparameters(Part):
         return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
     def _theta(self, learner: Host) -> dict[str, Tensor]:
-        return {**dict(learner.kernel.named_parameters()), "log_noise": learner.log_noise_variance}
+        return {**learner.kernel.hyperparameters(), "log_noise": learner.log_noise_variance}
 
     def descend(self, learner: Host, *, moved: bool = False) -> None:
         """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.

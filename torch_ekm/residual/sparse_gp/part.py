@@ -117,7 +117,7 @@ class Host(DoubleStateLearner):
     """What a part finds in its learner: the state, and how it is forgotten and learned again."""
 
     kernel: Kernel
-    log_noise_variance: nn.Parameter
+    log_noise_variance: Tensor
     posterior: SparsePosterior
     units: Units
     engine: Any

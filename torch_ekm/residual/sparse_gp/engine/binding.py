@@ -46,12 +46,14 @@ class Bound:
         self._values: list[Any] = []
         self._moved: list[Tensor] = []
 
-    def watch(self, modules: Iterable[nn.Module], *owners: dict[str, Any]) -> None:
-        """What these hold must stay the same objects, and parameters at their addresses."""
+    def watch(
+        self, modules: Iterable[nn.Module], *owners: dict[str, Any], moved: Iterable[Tensor] = ()
+    ) -> None:
+        """What these hold must stay the same objects, and ``moved`` at their addresses."""
         own = [dicts for one in modules for dicts in (one._parameters, one._buffers)]
         self._owners = [one for one in (*own, *owners) if one]
         self._values = list(chain.from_iterable(map(dict.values, self._owners)))
-        self._moved = [t for t in self._values if isinstance(t, nn.Parameter)]  # by an assignment to .data
+        self._moved = list(moved)  # by an assignment to .data
         self._addresses = [t.data_ptr() for t in self._moved]
 
     def is_current(self) -> bool:
@@ -87,8 +89,8 @@ class Plan(Bound):
         self.all = np.ones(math.prod(self.shape), np.bool_)
         fields = self._fields(gp)
         tensors = [value for value in fields.values() if isinstance(value, Tensor)]
-        self.parameters = tuple(gp.kernel.parameters())
-        self.watch(gp.modules(), gp._modules)
+        self.parameters = tuple(gp.kernel.hyperparameters().values())
+        self.watch(gp.modules(), gp._modules, moved=(*self.parameters, gp.log_noise_variance))
         self.reason = _reason(gp, [*tensors, *self.parameters])
         self.usable = not self.reason
         if not self.usable:
@@ -173,7 +175,7 @@ def _reason(gp: Host, tensors: list[Tensor]) -> str:
 def _fleet_axes(kernel: Kernel) -> set[int]:
     """Numbers of axes that its parameters have in front of their own."""
     own = {"log_variance": 0, "weights": 2}
-    names = ((name.split("."), p) for name, p in kernel.named_parameters())
+    names = ((name.split("."), p) for name, p in kernel.hyperparameters().items())
     return {p.dim() - own.get(name[-1] if "log" in name[-1] else name[0], 1) for name, p in names}
 
 
