@@ -13,8 +13,8 @@ from torch import nn
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
-from ..base import DoubleStateLearner
 from ..kernels.kernel import Kernel
+from ..kinds import DoubleStateLearner
 from ..report import UpdateReport
 from ..running_scale import RunningScale
 from .posterior import SparsePosterior
