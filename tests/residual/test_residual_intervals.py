@@ -62,7 +62,7 @@ def test_a_fleet_has_an_interval_for_each_model():
     assert width[0] < width[1] < width[2]
 
 
-@pytest.mark.parametrize("level", [0.0, 1.0, -0.1, "much", float("nan")])
+@pytest.mark.parametrize("level", [0.0, 1.0, -0.1, float("nan")])
 def test_a_level_that_is_none_is_refused(level):
     learner = ZeroResidual(2, 1)
     with pytest.raises(ParameterError, match=r"in \(0, 1"):
