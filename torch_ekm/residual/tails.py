@@ -19,7 +19,8 @@ LARGEST = 14.0  # of the logarithm of a scale: a noise-free stream must not end 
 class EvenStudentT(StudentT):
     """Student's t of an even number nu of degrees of freedom, whose cdf is a sum::
 
-    F(t) = 1/2 + s/2 sum_{k < nu/2} a_k (1 - s^2)^k,   s = t / sqrt(nu + t^2),   a_k = prod_j (2j - 1)/(2j)
+    F(t) = 1/2 + s/2 sum_{k < nu/2} a_k (1 - s^2)^k,   s = t / sqrt(nu + t^2),   a_0 = 1
+    a_k = a_{k-1} (2k - 1)/(2k)
     """
 
     def cdf(self, value: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
