@@ -85,7 +85,7 @@ def test_a_fork_waits_for_the_step_of_a_thread(monkeypatch):
     descend = LearnHyperparameters.descend
     slow = lambda *what, **how: (time.sleep(0.5), descend(*what, **how))  # noqa: E731
     monkeypatch.setattr(LearnHyperparameters, "descend", slow)
-    learner, _ = learned(SparseOnlineGP, 24)  # the step before the rebuild after 32 has begun
+    learner, _ = learned(SparseOnlineGP, 28)  # the step before the rebuild after 32 has begun
     context = multiprocessing.get_context("fork")
     done = context.Queue()
     process = context.Process(target=_learn, args=(learner, done), daemon=True)

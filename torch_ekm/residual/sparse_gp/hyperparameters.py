@@ -58,7 +58,7 @@ class LearnHyperparameters(Part):
 
     Args:
         rate: Adam's first step on the logarithms of the hyperparameters.
-        steps: gradient steps per rebuild, spread over the samples up to a fourth of them before it; the last
+        steps: gradient steps per rebuild, spread over the samples up to an eighth of them before it; the last
             one starts where the others lead.
         memory: samples of the past to learn from, too (ReplayMemory); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
@@ -85,7 +85,7 @@ class LearnHyperparameters(Part):
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
-        ahead = self.window - self.window // 4
+        ahead = self.window - self.window // 8
         self._places = sorted({max(i * ahead // self.steps, 1) - 1 for i in range(1, self.steps + 1)})
         self.window_x = nn.Buffer(like.new_zeros(*fleet, self.window, like.shape[-1]))
         self.window_y = nn.Buffer(like.new_zeros(*fleet, self.window, posterior.out_features))

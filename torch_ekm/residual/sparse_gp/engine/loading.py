@@ -15,7 +15,15 @@ from ...._warnings import warn
 from ....exceptions import SpeedWarning
 
 _LAST = "torch_ekm.residual.numba_mixture"  #: of the modules of loops, which imports the others
-_SOURCES = "**/numba_*.py", "**/*plan.py", "sparse_gp/monitor.py", "experts.py", "tails.py", "misled.py"
+_SOURCES = (
+    "**/numba_*.py",
+    "**/*plan.py",
+    "sparse_gp/monitor.py",
+    "**/recursion.py",
+    "experts.py",
+    "tails.py",
+    "misled.py",
+)
 _OFF = (
     "compiled loops are off, so learners take longer: {}; if numba cannot write its cache, set "
     "NUMBA_CACHE_DIR to a folder that can be written"

@@ -19,7 +19,7 @@ from numba import njit, types
 
 from ..monitor import DISTRUSTED, DISTRUSTED_MOST, RATE
 from .numba_math import A1, A2, A3, EPS, I1, INNER, INT, TINY, F, exp
-from .recursion import TIE, TIE_KL
+from .recursion import LEAST_NOVELTY, TIE, TIE_KL
 
 #: what a kernel's ``kind`` means
 SQUARED_EXPONENTIAL, MATERN32, MATERN52 = 0, 1, 2
@@ -245,7 +245,7 @@ def absorb(
         level[0] += RATE * (distrusted - level[0])
         noise = (s2 + v) / weight - v
     full = count[0] == capacity
-    novel = gamma > threshold * prior
+    novel = gamma > max(threshold * prior, LEAST_NOVELTY * s2)
     dropped = 0.0 if novel else gamma
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
     figures[0], figures[1], figures[2], figures[3] = gamma / max(prior, TINY), nis, weight, v
