@@ -315,4 +315,4 @@ def test_as_many_gradient_steps_as_asked_for(steps: int, monkeypatch: pytest.Mon
     learner = SparseOnlineGP(1, 1, refresh_every=32, parts=[LearnHyperparameters(steps=steps)])
     for x in torch.linspace(-1, 1, 64)[:, None]:
         learner.update(x, x.sin())
-    assert len(made) == 2 * min(steps, 28)  # none in the last eighth of the samples
+    assert len(made) == 2 * min(steps, 32)

@@ -15,6 +15,7 @@ from torch.distributions import StudentT
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.residual import (
+    LearnHyperparameters,
     MixtureResidual,
     ProcessNoise,
     RecursiveLeastSquares,
@@ -282,17 +283,28 @@ def test_variance_and_slopes_are_those_of_all_experts() -> None:
     torch.testing.assert_close(law.variance, torch.minimum(expected, limit))
 
 
-def test_learners_rebuild_at_different_samples(monkeypatch) -> None:
+def test_learners_rebuild_and_descend_at_different_samples(monkeypatch) -> None:
     g, t = default_learner(3, 2, capacity=8), 0
-    rebuilt: list[int] = []
-    for member in g.members:
+    rebuilt: list[tuple[int, int]] = []
+    descended: list[tuple[int, int]] = []
+    for i, member in enumerate(g.members):
         gp: Any = member
-        monkeypatch.setattr(gp, "refresh", lambda own=gp.refresh: (rebuilt.append(t), own()))
+        learning = gp.part(LearnHyperparameters)
+        for of, name, seen in ((gp, "refresh", rebuilt), (learning, "descend", descended)):
+            own = getattr(of, name)
+
+            def call(*given, i=i, own=own, seen=seen, **options):
+                seen.append((t, i))
+                return own(*given, **options)
+
+            monkeypatch.setattr(of, name, call)
     x = torch.randn(192, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for t in range(192):
         g.update(x[t], x[t, :2])
-    late = [at for at in rebuilt if at >= 128]
-    assert len(late) == len(set(late)) == 8  # four in 32 samples
+    late = {pair for pair in rebuilt + descended if pair[0] >= 128}
+    assert len(late) == 12  # four rebuilds in 32 samples, and halfway a step of the two deep ones
+    assert len({t for t, _ in late}) == 12
+    assert len({t for t, _ in rebuilt if t >= 128}) == 8
 
 
 def test_the_default_keeps_a_linear_map() -> None:

@@ -6,13 +6,11 @@ import multiprocessing
 import os
 import pickle
 import threading
-import time
 
 import pytest
 import torch
 
 from torch_ekm.residual import (
-    LearnHyperparameters,
     LinearKernel,
     MixtureResidual,
     RecursiveLeastSquares,
@@ -77,21 +75,6 @@ def test_a_fork_while_another_thread_updates_goes_on():
         stop.set()
         thread.join()
     learner.update(x[0], x[0, :1])
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
-def test_a_fork_waits_for_the_step_of_a_thread(monkeypatch):
-    """The thread does not exist in the child, which would wait for it for ever."""
-    descend = LearnHyperparameters.descend
-    slow = lambda *what, **how: (time.sleep(0.5), descend(*what, **how))  # noqa: E731
-    monkeypatch.setattr(LearnHyperparameters, "descend", slow)
-    learner, _ = learned(SparseOnlineGP, 28)  # the step before the rebuild after 32 has begun
-    context = multiprocessing.get_context("fork")
-    done = context.Queue()
-    process = context.Process(target=_learn, args=(learner, done), daemon=True)
-    process.start()
-    done.get(timeout=30)
-    process.join()
 
 
 @pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares, ReplayMLP])

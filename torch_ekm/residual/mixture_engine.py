@@ -20,7 +20,7 @@ from .sparse_gp.engine.loading import load_loops
 def warm_up() -> bool:
     """Load the compiled loops now, not at the first update; returns whether there are any (extra ``fast``).
 
-    A fresh installation compiles them first, for half a minute. Without this call another process does so
+    A fresh installation compiles them first, for some ten seconds. Without this call another process does so
     meanwhile, and torch does the work.
     """
     return load_loops(wait=True) is not None
@@ -77,8 +77,6 @@ class CompiledMixture:
         """All that an update does; None: torch must do it."""
         bound = self._takes(g, x)
         if bound is None or not is_plain_one(y, (*g.batch_shape, g.out_features)):
-            return None
-        if torch.is_inference_mode_enabled():  # its tensors cannot be learned from later
             return None
         x, y, plans, members = x.contiguous(), y.contiguous(), self._plans, self._learners
         loops: Any = load_loops()

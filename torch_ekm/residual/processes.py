@@ -10,8 +10,6 @@ from typing import Any
 
 import torch
 
-from . import worker
-
 _alive: weakref.WeakSet[Any] = weakref.WeakSet()
 _held: list[Any] = []
 _PATIENCE = 5.0  # for an update under way [s]
@@ -32,7 +30,6 @@ def unpickled(kind: Any, state: bytes) -> Any:
 def _before_fork() -> None:
     """No update is under way: a child has only the thread that forked, so it would stay half done there."""
     _held.extend(learner for learner in list(_alive) if learner.lock.acquire(timeout=_PATIENCE))
-    worker.rest()
 
 
 def _in_parent() -> None:

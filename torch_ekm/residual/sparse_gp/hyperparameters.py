@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-import functools
 import math
-from concurrent.futures import Future
-from typing import Any
 
 import torch
 from torch import nn
@@ -14,9 +10,8 @@ from torch import nn
 from ..._checks import check_count, check_positive
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
-from .. import worker
 from ..adam import Adam
-from ..kernels.kernel import Kernel, is_shared
+from ..kernels.kernel import is_shared
 from ..running_scale import write
 from . import plan as P
 from .forgetting import ForgettingFactor, ProcessNoise
@@ -51,15 +46,12 @@ class LearnHyperparameters(Part):
     that every later move makes a little wrong, so late moves must earn more than early ones; a system
     that changes is still followed.
 
-    Steps take longer than updates: on the CPU a thread takes them beside the updates that follow, and what it
-    finds is taken at the rebuild, however fast it was.
-
     It stands last among the parts: it asks those before it what they do with a sample.
 
     Args:
         rate: Adam's first step on the logarithms of the hyperparameters.
-        steps: gradient steps per rebuild, spread over the samples up to an eighth of them before it; the last
-            one starts where the others lead.
+        steps: gradient steps per rebuild, spread over the samples up to it; the last one starts where the
+            others lead.
         memory: samples of the past to learn from, too (ReplayMemory); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
 
@@ -68,7 +60,6 @@ class LearnHyperparameters(Part):
     """
 
     stands_last = True
-    _running: Future[None] | None = None
 
     def __init__(self, *, rate: float = 0.03, steps: int = 1, memory: int = 0) -> None:
         super().__init__()
@@ -85,8 +76,6 @@ class LearnHyperparameters(Part):
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
-        ahead = self.window - self.window // 8
-        self._places = sorted({max(i * ahead // self.steps, 1) - 1 for i in range(1, self.steps + 1)})
         self.window_x = nn.Buffer(like.new_zeros(*fleet, self.window, like.shape[-1]))
         self.window_y = nn.Buffer(like.new_zeros(*fleet, self.window, posterior.out_features))
         self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
@@ -134,53 +123,16 @@ class LearnHyperparameters(Part):
         return False
 
     def act(self, learner: Host) -> None:
-        """After the notes of a sample: begin a step, or move the parameters, when it is time."""
+        """After the notes of a sample: descend, and move the parameters, when it is time."""
         n = learner.n_samples
-        place = (n - learner.refresh_offset) % self.window
-        if place in self._places:
-            last = place == self._places[-1]
-            if not last or learner.is_due(n + self.window - place):
-                self._begin(learner, moved=last and self.steps > 1)
-        if learner.is_due(n + 1):
-            self.finish()
+        place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
+        between = (place + 1) * self.steps // self.window > place * self.steps // self.window
+        if due or (between and place + 1 < self.window):
+            if moved := due and self.steps > 1:
+                self._move(learner)
+            self.descend(learner, moved=moved)
+        if due:
             self._move(learner)
-
-    def _begin(self, learner: Host, *, moved: bool) -> None:
-        """A step on what is at hand now."""
-        self.finish()
-        on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
-        step = functools.partial(self.descend, learner, self.queries(learner), on, moved=moved)
-        if on.is_cpu:
-            self._running = worker.start(step)
-        else:
-            step()
-
-    def finish(self) -> None:
-        """Wait for the step that was begun."""
-        running, self._running = self._running, None
-        if running is not None:
-            running.result()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """A copy has no step under way."""
-        self.finish()
-        return {**vars(self)}
-
-    def state_dict(self, *args: Any, **options: Any) -> Any:
-        self.finish()
-        return super().state_dict(*args, **options)
-
-    def _load_from_state_dict(self, *args: Any, **options: Any) -> None:
-        self.finish()
-        super()._load_from_state_dict(*args, **options)
-
-    def _apply(self, fn: Any, recurse: bool = True) -> Any:
-        self.finish()
-        return super()._apply(fn, recurse)
-
-    def on_rebuild(self, learner: Host) -> None:
-        """The past state is about to be another one."""
-        self.finish()
 
     def after_rebuild(self, learner: Host) -> None:
         """The present state becomes the past one; the window is empty."""
@@ -191,7 +143,6 @@ class LearnHyperparameters(Part):
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models face another system: what they kept does not count any more."""
-        self.finish()
         self.window_on.masked_fill_(models.unsqueeze(-1), 0.0)
         self.loss.state.forget(models)
         if self.past is not None:
@@ -199,7 +150,6 @@ class LearnHyperparameters(Part):
 
     def reset(self) -> None:
         """Forget window, snapshot, memory and step sizes."""
-        self.finish()
         super().reset()
         self.adam.reset()
         self.loss.state.reset()
@@ -208,7 +158,7 @@ class LearnHyperparameters(Part):
 
     def queries(self, learner: Host) -> Queries:
         """The window, and this turn's part of the memory, in the learner's units."""
-        x, y, weight = self.window_x.clone(), self.window_y.clone(), self.window_on.clone()
+        x, y, weight = self.window_x, self.window_y, self.window_on
         absorbed = age = x.new_zeros(self.window)
         if self.past is not None:
             n = max(_REPLAYED * self.window, learner.posterior.capacity)
@@ -218,22 +168,19 @@ class LearnHyperparameters(Part):
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
         return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
-    @torch.no_grad()
-    def descend(
-        self, learner: Host, queries: Queries, on: Float[Tensor, "*batch"], *, moved: bool = False
-    ) -> None:
-        """A step of Adam on the loss, model by model; one not ``on`` or without finite gradient stays.
+    def _theta(self, learner: Host) -> dict[str, Tensor]:
+        return {**learner.kernel.hyperparameters(), "log_noise": learner.log_noise_variance}
+
+    def descend(self, learner: Host, *, moved: bool = False) -> None:
+        """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.
 
         The parameters move at the next rebuild: until then the caches are those of the old ones. ``moved``:
-        the step starts where those before it lead.
+        those of the past state are to be made again.
         """
-        kernel, log_noise = learner.kernel, learner.log_noise_variance
-        if moved:
-            kernel, log_noise = copy.deepcopy(kernel), log_noise.clone()
-            self._add_moves(_theta(kernel, log_noise))
-        parameters = _theta(kernel, log_noise)
-        _, gradients = self.loss.with_gradients(kernel, log_noise, queries, anew=moved)
-        self.n_steps.add_(on)
+        kernel, log_noise, parameters = learner.kernel, learner.log_noise_variance, self._theta(learner)
+        _, gradients = self.loss.with_gradients(kernel, log_noise, self.queries(learner), anew=moved)
+        on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
+        self.n_steps += on
         n = self.n_steps.clamp_min(1.0)
         correction, decay = self.adam.correction(n) * _shrink(n), _NETWORK_DECAY * _shrink(n)
         decay = decay * on * parameters["log_noise"].mean(-1).exp().clamp_max(1.0)
@@ -254,20 +201,12 @@ class LearnHyperparameters(Part):
 
     def _move(self, learner: Host) -> None:
         """The parameters as the steps since the last rebuild want them."""
-        self._add_moves(_theta(learner.kernel, learner.log_noise_variance))
-        for name, move in self.named_buffers(recurse=False):
-            if name.startswith("move_"):
-                move.zero_()
-
-    def _add_moves(self, parameters: dict[str, Tensor]) -> None:
-        for i, (name, p) in enumerate(parameters.items()):
-            p.add_(self.get_buffer(f"move_{i}"))
+        for i, (name, p) in enumerate(self._theta(learner).items()):
+            move = self.get_buffer(f"move_{i}")
+            p.add_(move)
+            move.zero_()
             if name.split(".")[-1].startswith("log_"):  # far beyond what standardised data can mean
                 p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)
-
-
-def _theta(kernel: Kernel, log_noise: Tensor) -> dict[str, Tensor]:
-    return {**kernel.hyperparameters(), "log_noise": log_noise}
 
 
 def _shrink(n: Tensor) -> Tensor:

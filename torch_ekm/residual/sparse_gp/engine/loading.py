@@ -29,7 +29,7 @@ _OFF = (
     "NUMBA_CACHE_DIR to a folder that can be written"
 )
 _FIRST_TIME = (
-    "a process in the background compiles loops, once and for some half a minute; until then torch does the "
+    "a process in the background compiles loops, once and for some ten seconds; until then torch does the "
     "work, and results may differ by rounding. torch_ekm.warm_up() waits for them"
 )
 
