@@ -23,7 +23,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).with_name("learners")))
 
-from bench_learners import PlainC, alternately, filled, gpytorch_fantasy, river_forest, samples, timed
+from bench_learners import PlainC, all_of, alternately, filled, gpytorch_fantasy, river_forest, samples, timed
 
 from torch_ekm import EnhancedModel, default_learner, warm_up
 from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget
@@ -36,6 +36,7 @@ from torch_ekm.simulation import SimulatedHand
 from torch_ekm.typing import Tensor
 
 IN, OUT = 20, 6  # of the learner
+FLEET = "update of a fleet, a model"
 FIRST = """import time
 begin = time.perf_counter()
 import torch
@@ -55,16 +56,22 @@ class Speed:
     times: dict[str, list[float]] = field(default_factory=dict)
     sizes: Sequence[int] = ()
     costs: dict[str, list[float]] = field(default_factory=dict)
+    plain: dict[str, float] = field(default_factory=dict)
+    """Microseconds of plain C, 100 points."""
 
     @property
     def verdict(self) -> str:
         motion, update = (np.array(self.times[name]) for name in ("motion", "update"))
         late, slow = 1e3 * np.quantile(motion, 0.99), 1e6 * np.quantile(update, 0.99)
+        slopes, fleet = (1e6 * np.median(self.times[name]) for name in ("prediction with Jacobians", FLEET))
+        c, c_slopes = self.plain["update"], self.plain["predict"]
         return (
             f"motion {1e3 * np.median(motion):.2f} ms (99 % {late:.2f}), "
-            f"default update {1e6 * np.mean(update):.0f} us mean (99 % {slow:.0f}), "
             f"cold start {np.median(self.times['first update, fresh installation']):.2f} s, "
-            f"linearize {1e3 * np.median(self.times['linearize']):.2f} ms"
+            f"linearize {1e3 * np.median(self.times['linearize']):.2f} ms, "
+            f"default update {1e6 * np.median(update):.0f} us median, 99 % {slow:.0f} us; "
+            f"Jacobians {slopes:.0f} us; fleet {fleet:.0f} us "
+            f"({1e6 * np.median(update) / c:.0f}, {slow / c:.0f} and {slopes / c_slopes:.0f} times plain C)"
         )
 
     def table(self) -> Table:
@@ -121,6 +128,15 @@ def of_learner(n: int) -> dict[str, list[float]]:
             for name, seconds in zip(times, (each[3], each[0], each[1]), strict=True):
                 times[name].append(seconds)
     return times
+
+
+def of_fleet(models: int) -> dict[str, list[float]]:
+    """A fleet of default learners of 30 points, time of one model, all that falls due included."""
+    shape = (models,)
+    learn = all_of(default_learner(IN, OUT, batch_shape=shape, capacity=30), OUT, shape, 32)
+    for _ in range(2):  # the bases are full then
+        learn()
+    return {FLEET: [timed(learn) / (32 * models) for _ in range(3)]}
 
 
 class Clocked(PlantWrapper):
@@ -189,6 +205,9 @@ def measure(quick: bool) -> Speed:
     """All of it, in one run."""
     warm_up()
     times = of_learner(90 if quick else 1500)
+    times |= of_fleet(4 if quick else 256)
+    limit = PlainC(100, OUT)
+    plain = {name: limit.microseconds(name) for name in ("update", "predict")}
     times |= of_motions([3.0] if quick else [15.0, -15.0, 10.0, -20.0, 20.0])
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as cache:
         # a quick run takes the loops that are there: to compile them is long
@@ -198,7 +217,7 @@ def measure(quick: bool) -> Speed:
         subprocess.run([sys.executable, "-c", warm], env=environment, check=True)
         times |= of_start(environment, "fresh process")
     sizes = (10, 20) if quick else (10, 30, 100, 300)
-    return Speed(times, sizes, by_size(sizes, 1 if quick else 3, 0.01 if quick else 0.3))
+    return Speed(times, sizes, by_size(sizes, 1 if quick else 3, 0.01 if quick else 0.3), plain)
 
 
 def main(arguments: list[str] | None = None) -> None:

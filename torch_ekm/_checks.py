@@ -71,6 +71,13 @@ def check_fraction(name: str, value: float) -> float:
     return float(value)
 
 
+def check_share(name: str, value: float) -> float:
+    """``value`` as a float in (0, 1), or ParameterError."""
+    if check_fraction(name, value) == 1:
+        raise ParameterError(name, value, "in (0, 1)")
+    return float(value)
+
+
 def check_shape(name: str, value: Tensor, shape: Sequence[int], hint: str = "") -> None:
     """ShapeError, with the hint, if ``value`` has any other shape, ParameterError if it is no tensor."""
     check_kind(name, value, Tensor, "a tensor: torch.as_tensor(...)")

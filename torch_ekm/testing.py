@@ -14,6 +14,7 @@ from torch.distributions import Normal
 from .exceptions import EKMError, NonFiniteError, NoStateError, ParameterError, ShapeError, StateMismatchError
 from .plant import FollowingPlant, Observation, Path
 from .residual.base import ResidualLearner, UpdateReport
+from .residual.kernels.kernel import Kernel
 
 __all__ = ["check_following_plant", "check_residual_learner"]
 
@@ -244,9 +245,16 @@ def _check_skip(learner: ResidualLearner, x: Tensor, y: Tensor) -> None:
 def _check_reset(learner: ResidualLearner, factory: Callable, x: Tensor) -> None:
     """``learner`` was reset; if its hyperparameters did not move it must be as new."""
     fresh = factory(dtype=learner.dtype)
-    if all(torch.equal(a, b) for a, b in zip(learner.parameters(), fresh.parameters(), strict=True)):
+    if all(map(torch.equal, _learned(learner), _learned(fresh))):
         deviations = learner.predict(x).stddev, fresh.predict(x).stddev
         _close(*deviations, learner, "reset() leaves the deviation of what was learned")
+
+
+def _learned(learner: ResidualLearner) -> list[Tensor]:
+    """Hyperparameters that a reset keeps."""
+    kernels = [one for one in learner.modules() if isinstance(one, Kernel)]
+    noise = [t for name, t in learner.named_buffers() if name.endswith("log_noise_variance")]
+    return [*(t for one in kernels for t in one.hyperparameters().values()), *noise, *learner.parameters()]
 
 
 def _check_bounds(learner: ResidualLearner) -> None:

@@ -9,8 +9,8 @@ from torch import nn
 
 from torch_ekm._checks import check_count, check_fraction, check_positive
 from torch_ekm.residual import Kernel, Matern32, UpdateEvent, UpdateReport
-from torch_ekm.residual.base import DoubleStateLearner, SingleLearner
 from torch_ekm.residual.baselines.scaled import ScaledLearner
+from torch_ekm.residual.kinds import DoubleStateLearner, SingleLearner
 from torch_ekm.typing import Tensor
 
 

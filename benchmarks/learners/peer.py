@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch.distributions import Normal
 
-from torch_ekm.residual.base import SingleLearner
+from torch_ekm.residual.kinds import SingleLearner
 from torch_ekm.residual.report import UpdateReport
 from torch_ekm.typing import Tensor
 

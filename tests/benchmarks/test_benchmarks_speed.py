@@ -26,22 +26,27 @@ from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 def test_what_is_said_of_times() -> None:
     times = {
         "motion": [0.004] * 98 + [0.02, 0.02], "update": [1e-4, 3e-4], "linearize": [0.002],
-        "first update, fresh installation": [1.5],
+        "first update, fresh installation": [1.5], "prediction with Jacobians": [6e-5],
+        "update of a fleet, a model": [4e-5, 5e-5, 6e-5],
     }  # fmt: skip
-    said = speed.Speed(times).verdict
-    expected = "motion 4.00 ms (99 % 20.00), default update 200 us mean (99 % 298), cold start 1.50 s, "
-    assert said == expected + "linearize 2.00 ms"
+    said = speed.Speed(times, plain={"update": 10.0, "predict": 6.0}).verdict
+    expected = (
+        "motion 4.00 ms (99 % 20.00), cold start 1.50 s, linearize 2.00 ms, default update 200 us median, "
+    )
+    expected += "99 % 298 us; Jacobians 60 us; fleet 50 us (20, 30 and 10 times plain C)"
+    assert said == expected
 
 
 @pytest.mark.slow
 def test_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     speed.main(["--quick", "--out", str(tmp_path)])
     last = capsys.readouterr().out.splitlines()[-1]
-    motion, update = r"motion \S+ ms \(99 % \S+\)", r"default update \d+ us mean \(99 % \d+\)"
-    assert re.fullmatch(rf"{motion}, {update}, cold start \S+ s, linearize \S+ ms", last)
+    motion, update = r"motion \S+ ms \(99 % \S+\)", r"default update \d+ us median, 99 % \d+ us"
+    rest = r"Jacobians \d+ us; fleet \d+ us \(\d+, \d+ and \d+ times plain C\)"
+    assert re.fullmatch(rf"{motion}, cold start \S+ s, linearize \S+ ms, {update}; {rest}", last)
     assert (tmp_path / "speed.svg").is_file()
     rows = (tmp_path / "speed.csv").read_text().splitlines()
-    assert len(rows) == 10
+    assert len(rows) == 11
     assert np.finfo(float).tiny / np.array([4.0]) > 0  # subnormal numbers are as they were
 
 

@@ -85,7 +85,7 @@ def of_kind(kind: type[Kernel], fleet: tuple[int, ...]) -> Kernel:
 def test_kernels_carry_derivatives_back_as_autograd_does(kind, fleet):
     kernel: Any = of_kind(kind, fleet)
     generator = torch.Generator().manual_seed(0)
-    for p in kernel.parameters():
+    for p in kernel.buffers():
         p.data += 0.3 * torch.randn(p.shape, generator=generator, dtype=torch.float64)
     x, by, by_diagonal = (
         torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -101,7 +101,7 @@ def test_kernels_carry_derivatives_back_as_autograd_does(kind, fleet):
         assert expected is not None
         assert float(expected.abs().max()) > 1e-3
         torch.testing.assert_close(mine, expected, atol=1e-12, rtol=1e-9)
-    assert not any(p.requires_grad for p in kernel.parameters())
+    assert not any(p.requires_grad for p in kernel.buffers())
 
 
 @pytest.mark.parametrize("fleet", [(), (3,)])
@@ -122,7 +122,7 @@ def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fad
     learning = learning_of(gp)
     queries = learning.queries(gp)
     assert queries.x.shape[-2] > 16
-    parameters = [*gp.kernel.parameters(), gp.log_noise_variance]
+    parameters = [*gp.kernel.buffers(), gp.log_noise_variance]
     found = learning.loss.with_gradients(gp.kernel, gp.log_noise_variance, queries)
     for p in parameters:
         p.requires_grad_(True)

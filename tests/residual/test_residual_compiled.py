@@ -69,6 +69,7 @@ OPTIONS = {
         "kernel": DeepKernel(SquaredExponential(D), hidden=(8,)),
         "parts": [Standardize()],
     },
+    "unknown": lambda shape: {"kernel": Periodic(D)},
     "noises": lambda shape: {"noise_variance": torch.tensor([0.1, 0.3]).double()},
     "wanders": lambda shape: {"parts": [ProcessNoise(0.01), RobustWeight(2.0)], "refresh_every": 8},
     "offset": lambda shape: {"parts": [Standardize(output_offset="learned"), RobustWeight(3.0)]},
@@ -120,6 +121,10 @@ def test_compiled_loops_do_what_torch_does(name, shape):
         assert_alike(reference, fast, x, float(y.abs().max()), exact)
 
 
+class Periodic(SquaredExponential):
+    pass
+
+
 class Doubling(RobustWeight):
     def weigh(self, nis, mask):
         return 0.5 * super().weigh(nis, mask)
@@ -127,11 +132,13 @@ class Doubling(RobustWeight):
 
 def used(gp: SparseOnlineGP, call, monkeypatch) -> bool:
     """Whether the call reached a compiled loop that worked."""
-    done = []
-    for name in ("_absorb", "_query"):
-        loop = getattr(gp.engine, name, None)
-        if loop is not None:
-            monkeypatch.setattr(gp.engine, name, lambda *args, loop=loop: (done.append(True), loop(*args)))
+    done, loops = [], loading.load_loops()
+    if loops is None:
+        call()
+        return False
+    for name in ("update_fleet", "query_fleet"):
+        loop = getattr(loops, name)
+        monkeypatch.setattr(loops, name, lambda *args, loop=loop: (done.append(True), loop(*args))[1])
     call()
     monkeypatch.undo()
     return bool(done)
@@ -155,13 +162,30 @@ def test_where_torch_must_do_the_work(monkeypatch):
         dual = torch.autograd.forward_ad.make_dual(query, torch.ones_like(query))
         tangent = torch.autograd.forward_ad.unpack_dual(gp(dual)).tangent
     torch.testing.assert_close(tangent, gp.linearize(query)[1].sum(-1))
-    gp.kernel.requires_grad_(True)
+    lengthscale = gp.kernel.log_lengthscale.requires_grad_(True)
     assert gp(query).requires_grad
-    gp.kernel.requires_grad_(False)
+    lengthscale.requires_grad_(False)
     single = copy.deepcopy(gp).to(torch.float32)
-    assert not used(single, lambda: single.update(x[0].float(), y[0].float()), monkeypatch)
     other = SparseOnlineGP(D, M, capacity=12, parts=[Doubling(3.0)])
-    assert not used(other, lambda: other.update(x[0], y[0]), monkeypatch)
+    for learner, said in (
+        (other, "its part, Doubling"),
+        (single, "float64"),
+        (pair("unknown")[1], "Periodic"),
+    ):
+        with pytest.warns(SpeedWarning, match=said):
+            assert not used(learner, lambda learner=learner: learner.update(x[0], y[0]), monkeypatch)
+
+
+@numba_here
+def test_rows_that_are_not_contiguous_are_learned_as_they_are(monkeypatch):
+    x, y = hard_stream(30)
+    gp, other = pair("all")[1], pair("all")[1]
+    apart = x.mT.contiguous().mT
+    assert not apart[0].is_contiguous()
+    for t in range(len(x)):
+        assert used(other, lambda t=t: other.update(apart[t], y[t]), monkeypatch)
+        gp.update(x[t], y[t])
+        assert torch.equal(gp(x[t]), other(apart[t]))
 
 
 @numba_here
@@ -176,7 +200,7 @@ def test_an_answer_follows_samples_and_parameters(name):
     gp.update(query, y[50])
     torch.testing.assert_close(gp(query), gp(query.unsqueeze(0))[0])
     assert not torch.equal(gp(query), changed)
-    next(gp.kernel.parameters()).add_(0.1)
+    next(gp.kernel.buffers()).add_(0.1)
     gp.refresh()
     torch.testing.assert_close(gp(query), gp(query.unsqueeze(0))[0])
 
@@ -217,11 +241,12 @@ def test_without_numba_torch_does_it_all(monkeypatch):
     reference = pair("all")[0]
     reference.update(x, y)
     monkeypatch.setitem(sys.modules, "numba", None)
-    engine = "torch_ekm.residual.sparse_gp.engine"
-    monkeypatch.delitem(sys.modules, f"{engine}.numba_kernels", raising=False)
-    monkeypatch.delattr(sys.modules[engine], "numba_kernels", raising=False)
-    monkeypatch.delitem(sys.modules, f"{engine}.numba_network", raising=False)
-    monkeypatch.delattr(sys.modules[engine], "numba_network", raising=False)
+    for name in [
+        name for name in sys.modules if name.startswith("torch_ekm.residual.") and ".numba_" in name
+    ]:
+        package, _, module = name.rpartition(".")
+        monkeypatch.delitem(sys.modules, name)
+        monkeypatch.delattr(sys.modules[package], module)
     monkeypatch.setattr(loading, "_loader", loading.Loader())
     assert not warm_up()
     gp = pair("all")[1]

@@ -268,6 +268,19 @@ def test_compiled_loops_cut_where_torch_does(kernel):
     assert cut > 5
 
 
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+def test_a_point_without_effect_makes_no_basis_vector(engine):
+    """Its variance is that of an action of 1e-17, whose inverse would multiply what comes."""
+    gp = SparseOnlineGP(2, 1, kernel=ActionLinearKernel(2, 1), parts=(), standardize=False)
+    if engine == "torch":
+        gp.engine = ReferenceEngine()
+    one = torch.ones(1, dtype=torch.float64)
+    gp.update(torch.tensor([0.3, 1e-17], dtype=torch.float64), one)
+    gp.update(torch.tensor([0.2, 1.0], dtype=torch.float64), one)
+    assert int(gp.posterior.count) == 1
+    assert float(gp.posterior.moments.abs().max()) < 1e3
+
+
 def test_the_command_ends_with_what_it_found(capsys):
     hostile_streams.main(["--quick"])
     assert "NaN 0, largest |g|/|y|" in capsys.readouterr().out.splitlines()[-1]

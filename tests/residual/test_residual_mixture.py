@@ -248,7 +248,7 @@ def test_the_report_is_that_of_all_members() -> None:
 @pytest.mark.parametrize("fleet", [(), (3,)])
 def test_compiled_loops_judge_as_torch_does(fleet) -> None:
     made = [default_learner(3, 2, capacity=8, batch_shape=fleet, on_invalid="skip") for _ in range(2)]
-    made[1]._judge.judge = made[1]._judge.combine = lambda *given: None
+    made[1]._engine.learn = made[1]._engine.ask = lambda *given: None
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(45, *fleet, 3, generator=generator, dtype=torch.float64)
     y = torch.sin(x[..., :2]) + 0.1 * torch.randn(45, *fleet, 2, generator=generator, dtype=torch.float64)

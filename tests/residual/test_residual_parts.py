@@ -135,7 +135,9 @@ def test_reset_is_a_fresh_start(name):
     g, fresh = learner(PARTS[name]), learner(PARTS[name])
     g.update(x, y)
     with torch.no_grad():  # hyperparameters stay, by contract
-        for mine, theirs in zip(g.parameters(), fresh.parameters(), strict=True):
+        for mine, theirs in zip(
+            *([*one.kernel.buffers(), one.log_noise_variance] for one in (g, fresh)), strict=True
+        ):
             theirs.copy_(mine)
     g.reset()
     assert same(g, fresh, x)

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.distributions import Distribution, Normal
 
-from .._checks import check_count, check_counts, check_finite
+from .._checks import check_count, check_counts, check_finite, check_share
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError, StateError
 from ..typing import Bool, Float, Tensor
@@ -97,9 +97,30 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
         """Law of y, for log densities: ``predict`` with noise, unless a learner has a better one.
 
-        ``log_prob(y)`` has the shape of y. Learners of heavy-tailed noise override it.
+        ``log_prob(y)``, ``cdf(y)`` and ``icdf(p)`` have the shape of y. Learners of heavy-tailed noise
+        override it.
         """
         return self.predict(x, observation=True)
+
+    def quantile(self, x: Float[Tensor, "*any in_features"], p: float) -> Float[Tensor, "*all out_features"]:
+        """What y stays below with probability p, of each output.
+
+        Raises:
+            ParameterError: p is not in (0, 1).
+        """
+        share = torch.as_tensor(check_share("p", p), dtype=self.dtype, device=self.device)
+        return self.predictive(x).icdf(share)
+
+    def interval(
+        self, x: Float[Tensor, "*any in_features"], level: float = 0.9
+    ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features"]]:
+        """Lower and upper end of what y lies in with probability ``level``, with equal tails, of each output.
+
+        Raises:
+            ParameterError: the level is not in (0, 1).
+        """
+        out = 0.5 - 0.5 * check_share("level", level)
+        return self.quantile(x, out), self.quantile(x, 1.0 - out)
 
     def moments(
         self, x: Float[Tensor, "*any in_features"], *, observation: bool = False
@@ -352,42 +373,3 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def extra_repr(self) -> str:
         fleet = f", batch_shape={tuple(self.batch_shape)}" if self.batch_shape else ""
         return f"in_features={self.in_features}, out_features={self.out_features}{fleet}"
-
-
-class DoubleStateLearner(ResidualLearner):
-    """A learner whose state is float64 for any dtype of its inputs and outputs.
-
-    Device moves take all along; a change of dtype is one of the interface only: float32 cannot hold the
-    inverse of a smooth kernel's matrix.
-    """
-
-    def _apply(self, fn, recurse=True):
-        def keep_double(tensor):
-            moved = fn(tensor)
-            if tensor is self._like or not tensor.is_floating_point():
-                return moved
-            return tensor.to(moved.device)
-
-        return super()._apply(keep_double, recurse)
-
-    @property
-    def _kept(self) -> torch.dtype:
-        return torch.float64
-
-
-class SingleLearner(ResidualLearner):
-    """A learner that is one model: ``batch_shape`` must be ``()``.
-
-    Its ``absorb`` gets samples only, never a mask.
-    """
-
-    def __init__(self, in_features: int, out_features: int, **options) -> None:
-        super().__init__(in_features, out_features, **options)
-        if self.batch_shape:
-            valid = "() for this learner; make one for each model"
-            raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
-
-    def step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        if mask is not None and not bool(mask):
-            return UpdateReport.of_nothing(mask, self.dtype)
-        return super().step(x, y, None)

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import nn
 
-from .._arrays import is_plain
 from ..typing import Bool, Float, Tensor
 
-_WORSE = 16.0  # squared errors of so many times the square of y
-_RATE, _ALARM = 1 / 16, 0.6
+WORSE = 16.0  # squared errors of so many times the square of y
+MISLED_RATE, ALARM = 1 / 16, 0.6
 
 
 class Misled(nn.Module):
@@ -32,21 +30,16 @@ class Misled(nn.Module):
 
     def observe(
         self, error: Float[Tensor, "*batch out"], y: Float[Tensor, "*batch out"], mask: Tensor | None
-    ) -> Bool[Tensor, "*batch"] | None:
-        """Models that are misled, given errors before the update; they begin to count again. None: none."""
-        level = self.level
-        if mask is None and is_plain(error, y, level):
-            e, t, a = error.numpy(), y.numpy(), level.numpy()
-            with np.errstate(over="ignore"):  # an infinite square is larger, too
-                a += _RATE * ((np.square(e).sum(-1) > _WORSE * np.square(t).sum(-1)) - a)
-            if a.max() <= _ALARM:
-                return None
-        else:
-            worse = error.square().sum(-1) > _WORSE * y.square().sum(-1)
-            step = _RATE * (worse.to(level.dtype) - level)
-            level += step if mask is None else step * mask
-        misled = level > _ALARM
+    ) -> None:
+        """Take note of errors before the update."""
+        worse = error.square().sum(-1) > WORSE * y.square().sum(-1)
+        step = MISLED_RATE * (worse.to(self.level.dtype) - self.level)
+        self.level += step if mask is None else step * mask
+
+    def found(self) -> Bool[Tensor, "*batch"] | None:
+        """Models that are misled, which begin to count again. None: none."""
+        misled = self.level > ALARM
         if not misled.is_cuda and not bool(misled.any()):  # on a GPU looking would mean waiting
             return None
-        level.masked_fill_(misled, 0.0)
+        self.level.masked_fill_(misled, 0.0)
         return misled

@@ -26,7 +26,7 @@ from .experts import (
     TREND_DECAY,
     YOUNG,
 )
-from .mixture_engine import CompiledJudge
+from .mixture_engine import CompiledMixture
 from .printed import mixture
 from .report import MomentsWithJacobians, UpdateReport
 from .tails import MEMORY, ScaleMixture
@@ -111,7 +111,7 @@ class MixtureResidual(ResidualLearner):
         """1 where an expert takes its mean from that learner, ``(experts, learners)``."""
         # what is not believed of a share of 1 is split over the others
         prior = torch.where(self.shares == 1.0, _PRIOR, (1 - _PRIOR) / (len(_SHARES) - 1)).log()
-        self.prior = nn.Buffer(prior, persistent=False)
+        self.prior = nn.Buffer(prior.to(self._like), persistent=False)
         wide = (*self.batch_shape, self.out_features, len(owner))
         doubted = self.owner @ torch.tensor(doubts or [0.0] * len(members), **factory)
         self.first_evidence = nn.Buffer(-doubted.expand(wide), persistent=False)
@@ -130,26 +130,29 @@ class MixtureResidual(ResidualLearner):
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.tails = ScaleMixture(self.out_features, **fleet)
-        self._judge = CompiledJudge()
+        self._engine = CompiledMixture()
         self._settle()
 
     # -- predictions ----------------------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
         """Mean of all experts by their weights, ``sum_b gain_b m_b(x) + offset``."""
+        found = self._engine.ask(self, x)
+        if found is not None:
+            return found.mean
         x = self.check_query(x)
         return self._mean(torch.stack([learner(x).to(x.dtype) for learner in self.members], dim=-1))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
-        x = self.check_query(x)
         if observation:
-            mean, deviation, _ = self._standard(x)
+            mean, deviation = self._standard(x)
             return Normal(mean, deviation * self.inflation.sqrt(), validate_args=False)
-        each = [learner.both_moments(x) for learner in self.members]
-        found = self._judge.combine(self, x, each)
+        found = self._engine.ask(self, x, "deviation")
         if found is not None:
-            return Normal(found[0], found[1], validate_args=False)
+            return Normal(found.mean, found.deviation, validate_args=False)
+        x = self.check_query(x)
+        each = [learner.both_moments(x) for learner in self.members]
         mean, deviation, means = self._together([(m, v) for m, _, v in each])
         deviation = deviation * self.inflation.sqrt()
         variances = self._wide(torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype))
@@ -159,10 +162,13 @@ class MixtureResidual(ResidualLearner):
 
     def predictive(self, x: Tensor) -> Distribution:
         """Mixture of Student t laws about the mean: what log densities should be taken of."""
-        return self.tails.law(*self._standard(self.check_query(x))[:2])
+        return self.tails.law(*self._standard(x))
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The learners' slopes, weighted; what is carried over does not depend on x."""
+        found = self._engine.ask(self, x, "jacobian")
+        if found is not None:
+            return found.mean, found.jacobian
         x = self.check_query(x)
         pairs = [learner.linearize(x) for learner in self.members]
         means, slopes = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*pairs, strict=True))
@@ -186,6 +192,9 @@ class MixtureResidual(ResidualLearner):
         Raises:
             ParameterError: a learner does not give its own in closed form.
         """
+        found = self._engine.ask(self, x, "variance", "jacobian", "slope")
+        if found is not None:
+            return MomentsWithJacobians(found.mean, found.variance, found.jacobian, found.slope)
         x = self.check_query(x)
         for learner in self.members:
             if not hasattr(learner, "predict_with_jacobians"):
@@ -265,11 +274,21 @@ class MixtureResidual(ResidualLearner):
             learner.new_sequence()
         self._settle()
 
+    def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
+        """See :meth:`ResidualLearner.update`; single samples that the engine accepts skip its checks."""
+        if mask is None:
+            with self.lock:
+                report = self._engine.learn(self, x, y, None)
+                if report is not None:
+                    return report
+        return super().update(x, y, mask)
+
+    @torch.no_grad()
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        moments = [learner.moments(x, observation=True) for learner in self.members]
-        nis = self._judge.judge(self, y, mask, moments)
-        if nis is None:
-            nis = self._judged(y, mask, moments)
+        report = self._engine.learn(self, x, y, mask)
+        if report is not None:
+            return report
+        nis = self._judged(y, mask, [learner.moments(x, observation=True) for learner in self.members])
         reports = [learner.step(x, y, mask) for learner in self.members]
         part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
@@ -351,9 +370,13 @@ class MixtureResidual(ResidualLearner):
         inside = self._shares.square() * variances.unsqueeze(-1)
         return (self.mass * (inside + apart.square()) + self.spread).sum((-2, -1))
 
-    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, the deviation by which innovations are standardised (the learners' own), their means."""
-        return self._together([learner.moments(x, observation=True) for learner in self.members])
+    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean, and the deviation by which innovations are standardised (the learners' own)."""
+        found = self._engine.ask(self, x, "standard")
+        if found is not None:
+            return found.mean, found.standard
+        x = self.check_query(x)
+        return self._together([learner.moments(x, observation=True) for learner in self.members])[:2]
 
     def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
         means, variances = (torch.stack(part, dim=-1).to(self.dtype) for part in zip(*moments, strict=True))

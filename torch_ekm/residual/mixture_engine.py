@@ -1,16 +1,19 @@
-"""What judges the experts of a mixture: its buffers as the compiled loops see them."""
+"""The engine of a mixture: its buffers, and those of its learners, as compiled loops see them."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch.distributions import StudentT
 
-from ..typing import Array, Tensor
-from .base import FARTHEST
-from .sparse_gp.engine.compiled import is_plain_one, sources_of
+from ..typing import Tensor
+from . import mixture_plan as G
+from .report import UpdateReport
+from .sparse_gp import plan as P
+from .sparse_gp.engine.binding import Bound, Plan
+from .sparse_gp.engine.compiled import CompiledEngine, is_plain_one, on_array
 from .sparse_gp.engine.loading import load_loops
 
 
@@ -20,117 +23,149 @@ def warm_up() -> bool:
     A fresh installation compiles them first, for some ten seconds. Without this call another process does so
     meanwhile, and torch does the work.
     """
-    if load_loops(wait=True) is None:
-        return False
-    from . import numba_mixture  # noqa: F401  loaded by its import
-
-    return True
+    return load_loops(wait=True) is not None
 
 
-class CompiledJudge:
-    """A mixture's buffers as arrays that share their memory, made again whenever a buffer is another one.
+class Answer(NamedTuple):
+    """What a query of one sample per model gives; what was not wanted is empty."""
 
-    It judges on the CPU in float64, where numba is installed.
+    mean: Tensor
+    variance: Tensor  #: of g
+    deviation: Tensor  #: of g
+    standard: Tensor  #: deviation of y by which innovations are standardised
+    jacobian: Tensor  #: of the mean
+    slope: Tensor  #: of the variance
+
+
+class CompiledMixture:
+    """Updates and queries of one sample per model, on the memory of the mixture and its learners.
+
+    Bound again whenever a buffer is another one. Learners that compiled loops do not know predict and learn
+    on their own, and are judged here.
     """
 
     def __init__(self) -> None:
-        self._sources: list[tuple[dict, str, Tensor, int]] = []
-        self._usable = False
+        self._bound: Bound | None = None
+        self._plans: list[Plan | None] = []
 
-    def __deepcopy__(self, memo: dict) -> CompiledJudge:
-        return CompiledJudge()
+    def __deepcopy__(self, memo: dict) -> CompiledMixture:
+        return CompiledMixture()
 
     def __reduce__(self) -> tuple:
-        return CompiledJudge, ()
+        return CompiledMixture, ()
 
-    def judge(self, g: Any, y: Tensor, mask: Tensor | None, moments: list) -> Tensor | None:
-        """Take one sample per model in, given what the mixture's learners predicted; returns the nis.
+    # -- calls ----------------------------------------------------------------------------------
 
-        None: torch must do it.
-        """
-        if not self._takes(g):
+    def ask(self, g: Any, x: Tensor, *wanted: str) -> Answer | None:
+        """One query per model for these fields of an Answer; None: torch must do it."""
+        bound = self._takes(g, x)
+        if bound is None or None in self._plans:
             return None
-        means, variances, far, ratio, figures = self._work
-        rows = len(far)
-        for i, (mean, variance) in enumerate(moments):
-            means[:, i] = mean.numpy().reshape(rows)
-            variances[:, i] = variance.numpy().reshape(rows)
-        self._make_finite(means, variances)
-        on = np.ones(self._n, np.bool_) if mask is None else mask.numpy().reshape(self._n).copy()
-        nis, loops, a = np.empty(self._n), self._loops, self._arrays
-        with np.errstate(all="ignore"):
-            loops.measure_fleet(
-                y.contiguous().numpy().reshape(rows), means, variances, self._experts, a["innovation"],
-                a["level"], a["gain"], a["mass"], self._offset, self._inflation, FARTHEST * self._largest,
-                *self._tails, far, ratio, figures,
-            )  # fmt: skip
-            np.log1p(ratio, out=ratio)
-            loops.fold_fleet(
-                on, far, ratio, figures, self._experts, self._prior, a["evidence"], a["innovation"],
-                a["level"], a["trend"], self._inflation, self._count, *self._laws, *self._tails, nis,
-            )  # fmt: skip
-            np.exp(ratio, out=ratio)
-        loops.settle_fleet(
-            on, ratio, self._experts, a["innovation"], a["level"], a["mass"], a["shift"], a["spread"],
-            a["gain"], self._offset,
+        x, one, two = (
+            x.contiguous(),
+            (*g.batch_shape, g.out_features),
+            (*g.batch_shape, g.out_features, g.in_features),
+        )
+        shapes = zip(Answer._fields, (one, one, one, one, two, two), strict=True)
+        found = Answer(*(x.new_empty(s if name == "mean" or name in wanted else 0) for name, s in shapes))
+        loops: Any = load_loops()
+        loops.query_mixture(bound.row, self._members, x.data_ptr(), *(t.data_ptr() for t in found))
+        return found
+
+    @torch.no_grad()
+    def learn(self, g: Any, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        """All that an update does; None: torch must do it."""
+        bound = self._takes(g, x)
+        if bound is None or not is_plain_one(y, (*g.batch_shape, g.out_features)):
+            return None
+        x, y, plans, members = x.contiguous(), y.contiguous(), self._plans, self._learners
+        loops: Any = load_loops()
+        if not loops.are_finite(bound.row, x.data_ptr(), y.data_ptr()):
+            return None
+        n, m, k = len(bound.all), g.out_features, len(plans)
+        means, noisy = np.empty((n * m, k)), np.empty((n * m, k))
+        figures, events, errors = np.zeros((k, 4, n)), np.zeros((k, n), np.int64), np.zeros((k, n, m))
+        of_all = np.empty((3, n))
+        if mask is not None:
+            figures[:, 2] = 1.0
+        turns = []
+        for i, (plan, learner) in enumerate(zip(plans, members, strict=True)):
+            if plan is None:
+                mean, variance = learner.moments(x, observation=True)
+                means[:, i], noisy[:, i] = mean.reshape(-1).numpy(), variance.reshape(-1).numpy()
+            # what a part does first would change what the learner predicts
+            apart = plan is None or (
+                plan.units is not None and plan.units.acts_before(learner.n_samples, learner)
+            )
+            turns.append(_SKIP if apart else learner.engine.begin(learner, x, y, mask))
+        on = on_array(bound, mask)
+        alarm = loops.update_mixture(
+            bound.row, self._members, np.array(turns), on, x.data_ptr(), y.data_ptr(), means, noisy, figures,
+            events, errors, of_all,
         )  # fmt: skip
-        return torch.from_numpy(nis.reshape(tuple(g.batch_shape)))
+        done_apart = False
+        for i, (plan, learner) in enumerate(zip(plans, members, strict=True)):
+            if turns[i] is not _SKIP:
+                assert plan is not None
+                learner.engine.finish(
+                    learner, x, y, mask, bool(alarm >> i & 1), figures[i], events[i], errors[i]
+                )
+                continue
+            done_apart = True
+            report = learner.step(x, y, mask)
+            events[i], figures[i, 0] = report.event.reshape(-1), report.novelty.reshape(-1)
+            figures[i, 2] = report.weight.reshape(-1)
+        if done_apart:
+            part = g.weights.mean(-2).reshape(n, k).T.numpy()
+            of_all[1], of_all[2] = (part * figures[:, 0]).sum(0), (part * figures[:, 2]).sum(0)
+        nis, novelty, weight = torch.from_numpy(of_all.reshape(3, *g.batch_shape)).unbind()
+        event = torch.from_numpy(events.max(0).reshape(tuple(g.batch_shape)))
+        return UpdateReport(event, novelty, nis, weight)
 
-    def combine(self, g: Any, x: Tensor, each: list) -> Tensor | None:
-        """Mean and deviations of g and y, ``(3, *batch, out)``, given what the learners predict for one query
-        per model, see ``both_moments``.
+    # -- what they work on ----------------------------------------------------------------------
 
-        None: torch must do it.
-        """
+    def _takes(self, g: Any, x: Tensor) -> Bound | None:
+        """The buffers, where this call is one for compiled loops; binds them."""
         if torch.compiler.is_compiling() or not is_plain_one(x, (*g.batch_shape, g.in_features)):
             return None
-        if any(t.requires_grad for one in each for t in one) or not self._takes(g):
+        if g.dtype != torch.float64 or load_loops() is None:
             return None
-        a, out = self._arrays, np.empty((3, self._offset.size))
-        rows = [np.array([t.numpy().reshape(-1) for t in part]) for part in zip(*each, strict=True)]
-        parts = [np.array(part.T, dtype=np.float64, order="C") for part in rows]
-        self._make_finite(*parts)
-        self._loops.combine_fleet(
-            *parts, self._experts, a["gain"], a["mass"], a["shift"], a["spread"], self._offset,
-            self._inflation, FARTHEST * self._largest, out,
-        )  # fmt: skip
-        return torch.from_numpy(out.reshape(3, *g.offset.shape))
+        if self._bound is None or not self._bound.is_current():
+            self._bound = self._bind(g)
+            self._learners = g.members
+        plans = [
+            one.engine.of(one) if isinstance(getattr(one, "engine", None), CompiledEngine) else None
+            for one in self._learners
+        ]
+        if plans != self._plans:
+            self._plans = plans
+            none = np.zeros(P.FIELDS, np.int64)
+            self._members = np.stack([none if plan is None else plan.row for plan in plans])
+        return self._bound if self._bound.usable else None
 
-    def _make_finite(self, means: Array, *variances: Array) -> None:
-        """See ``_finite`` and ``_wide`` of the mixture."""
-        if not np.isfinite(means.sum() + sum(v.sum() for v in variances)):
-            np.nan_to_num(means, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
-            for v in variances:
-                np.copyto(v, np.square(self._largest)[:, None], where=~np.isfinite(v))
-
-    def _takes(self, g: Any) -> bool:
-        """Whether compiled loops can do it; prepares the arrays."""
-        if load_loops() is None:
-            return False
-        if any(owner.get(name) is not t or t.data_ptr() != at for owner, name, t, at in self._sources):
-            self._sources = []
-        if not self._sources:
-            self._bind(g)
-        return self._usable
-
-    def _bind(self, g: Any) -> None:
-        self._sources = sources_of(g, tuple(g.buffers(recurse=False)) + tuple(g.tails.buffers()))
-        on_host = g.dtype == torch.float64 and g.device.type == "cpu"
-        self._usable = on_host and all(t.is_contiguous() for _, _, t, _ in self._sources)
-        if not self._usable:
-            return
-        from . import numba_mixture
-
-        self._loops, self._n = numba_mixture, g.batch_shape.numel()
-        rows, (n_experts, n_learners) = self._n * g.out_features, g.owner.shape
-        names = "evidence", "innovation", "level", "trend", "gain", "mass", "shift", "spread"
-        self._arrays: dict[str, Array] = {k: g.get_buffer(k).numpy().reshape(rows, -1) for k in names}
-        self._offset, self._inflation = g.offset.numpy().reshape(-1), g.inflation.numpy().reshape(-1)
-        self._largest = g.largest.numpy().reshape(-1)
-        self._count, self._prior = g.count.numpy().reshape(-1), g.prior.double().numpy()
-        self._experts, tails = g.get_buffer("_experts").numpy(), g.tails
+    def _bind(self, g: Any) -> Bound:
+        bound, tails = Bound(), g.tails
         at_zero = StudentT(tails.freedoms).log_prob(torch.zeros_like(tails.freedoms))
-        self._laws = tuple(t.numpy() for t in (tails.rates, tails.freedoms, at_zero))
-        self._tails = tuple(t.numpy().reshape(rows, -1) for t in (tails.log_scale, tails.evidence))
-        learners, experts = np.empty((2, rows, n_learners)), np.empty((2, rows, n_experts))
-        self._work = *learners, *experts, np.empty((rows, 2))
+        fields = {
+            P.LARGEST: g.largest, G.EXPERTS: g._experts, G.PRIOR: g.prior, G.EVIDENCE: g.evidence,
+            G.INNOVATION: g.innovation, G.LEVEL: g.level, G.TREND: g.trend, G.GAIN: g.gain,
+            G.MASS: g.mass, G.SHIFT: g.shift, G.SPREAD: g.spread, G.OFFSET: g.offset,
+            G.INFLATION: g.inflation, G.COUNT: g.count, G.RATES: tails.rates,
+            G.FREEDOMS: tails.freedoms, G.TAIL_SCALE: tails.log_scale,
+            G.TAIL_EVIDENCE: tails.evidence,
+        }  # fmt: skip
+        bound.watch((g, tails), g._modules, g.learners._modules)
+        bound.usable = all(
+            t.is_cpu and t.is_contiguous() and t.dtype == torch.float64 for t in fields.values()
+        )
+        row = bound.row = np.zeros(G.FIELDS, np.int64)
+        for field, tensor in fields.items():
+            row[field] = tensor.data_ptr()
+        row[P.MODELS], row[P.IN], row[P.OUT] = g.batch_shape.numel(), g.in_features, g.out_features
+        row[G.N_EXPERTS], row[G.N_SHARES] = g.evidence.shape[-1], g.mass.shape[-1]
+        row[G.N_TAILS], row[G.AT_ZERO] = len(tails.rates), bound.own(at_zero.numpy().copy())
+        bound.all = np.ones(row[P.MODELS], np.bool_)
+        return bound
+
+
+_SKIP = P.SKIP, -1, -1, -1, -1, 0

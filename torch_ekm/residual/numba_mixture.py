@@ -1,10 +1,10 @@
-"""The experts of a mixture as compiled loops over a fleet (extra ``fast``).
+"""A mixture and its sparse GPs as compiled loops on their own memory.
 
 Equations and names are those of :class:`~torch_ekm.residual.MixtureResidual` and
-:class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. Arrays of two axes have a row for
-each output of each model, all but ``experts``: rows h, kappa, rho, beta, c, a column for each expert, those
-of the first learner first. Logarithms and exponentials of all experts are numpy's, which are vectorised,
-between the calls.
+:class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a row of
+:mod:`~torch_ekm.residual.mixture_plan`, ``members`` has one row of
+:mod:`~torch_ekm.residual.sparse_gp.plan` for each learner; of another kind of learner it is 0, and what it
+predicts is given.
 """
 
 from __future__ import annotations
@@ -14,208 +14,175 @@ import math
 import numpy as np
 from numba import njit, types
 
-from .experts import (
-    FARTHEST,
-    FREEDOM,
-    LEAST,
-    LEVEL_DECAY,
-    RATE,
-    RMS_LEAST,
-    RMS_MOST,
-    SQUARE_MOST,
-    TREND_DECAY,
-    YOUNG,
-)
-from .sparse_gp.engine.numba_kernels import _A1, _A2, _COMMON, _F, _INNER, _TINY
-from .tails import LARGEST, MEMORY
+from . import experts as E
+from . import mixture_plan as G
+from .base import FARTHEST as FARTHEST_MEAN
+from .numba_judge import judge, make_finite, mean_of, scatter_of
+from .sparse_gp import plan as P
+from .sparse_gp.engine import numba_core as gp
+from .sparse_gp.engine.numba_math import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
 
-_ON = types.boolean[::1]
-#: entries of ``figures``
-_Z, _SCALE = 0, 1
+are_finite, query_fleet, update_fleet = gp.are_finite, gp.query_fleet, gp.update_fleet
 
 
-@njit(_F(_F), **_INNER)
-def _bounded(z):
-    return min(max(z, -FARTHEST), FARTHEST) if z == z else FARTHEST
+@njit(types.void(I1, A3, A2), **INNER)
+def _of_all(g, figures, of_all):
+    """Novelty and weight of a sample, by the say of each learner."""
+    m, n_learners = g[P.OUT], figures.shape[0]
+    n_groups = n_learners * g[G.N_SHARES]
+    for b in range(g[P.MODELS]):
+        of_all[1, b] = of_all[2, b] = 0.0
+        for r in range(b * m, (b + 1) * m):
+            mass = vector_at(g[G.MASS], r, n_groups)
+            for k in range(n_groups):
+                i = k // g[G.N_SHARES]
+                of_all[1, b] += mass[k] * figures[i, 0, b] / m
+                of_all[2, b] += mass[k] * figures[i, 2, b] / m
 
 
-@njit(_F(_A1, _A1), **_INNER)
-def _typical(log_scale, evidence):
-    """See ``ScaleMixture.typical``."""
-    most, total, mean = -np.inf, 0.0, 0.0
-    for t in range(evidence.shape[0]):
-        most = max(most, evidence[t])
-    for t in range(evidence.shape[0]):
-        p = math.exp(evidence[t] - most)
-        total += p
-        mean += p * log_scale[t]
-    return math.exp(mean / total)
-
-
-@njit(types.void(_A1, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A1, _A2, _A2, _A2, _A2, _A2), **_COMMON)
-def measure_fleet(
-    y, means, variances, experts, innovation, level, gain, mass, offset, inflation, largest, log_scale,
-    tail_evidence, far, ratio, figures,
-):  # fmt: skip
-    r"""How far y lies from each expert's mean: ``far`` in typical scales, ``ratio = r / 10`` as it is judged.
+@njit(INT(I1, I2, I2, ON, INT, INT, A2, A2, A3, I2, A3, A2), **COMMON)
+def update_mixture(g, members, turns, on, x, y, means, noisy, figures, events, errors, of_all):
+    """One sample per model where ``on``: all learners predict, the mixture judges them, they learn.
 
     Args:
-        means, variances: of the learners' predictions of y.
-        largest: \|mean\| of the mixture, of each output.
-        figures: standardised innovation of the mixture's mean, and typical scale, of each output.
+        turns: what each learner does, see its plan.
+        x, y: addresses.
+        means, noisy: of y, from learners of other kinds, ``(models out, learners)``.
+        figures, events, errors: see ``update_fleet``, one for each learner.
+        of_all: nis, novelty and weight of the mixture, ``(3, models)``; the last two where all learned here.
+
+    Returns:
+        A bit for each learner of which a model faces another system.
     """
-    h, kappa, n_learners = experts[0], experts[1], means.shape[1]
-    each, n_shares = experts.shape[1] // n_learners, mass.shape[1] // n_learners
-    for o in range(y.shape[0]):
-        mean, variance = offset[o], 0.0
-        for i in range(n_learners):
-            mean += gain[o, i] * means[o, i]
-            for s in range(n_shares):
-                variance += mass[o, i * n_shares + s] * variances[o, i]
-        mean, deviation = min(max(mean, -largest[o]), largest[o]), math.sqrt(variance)
-        typical = _typical(log_scale[o], tail_evidence[o])
-        scale = deviation * typical
-        figures[o, _Z], figures[o, _SCALE] = _bounded((y[o] - mean) / deviation), scale
-        width = min(max(RMS_LEAST * math.sqrt(inflation[o]) / typical, 1.0), RMS_MOST)
-        w, lev, row = innovation[o], level[o], far[o]
-        for i in range(n_learners):
-            for e in range(i * each, (i + 1) * each):
-                row[e] = h[e] * means[o, i] - kappa[e] * w[e]
-        for e in range(row.shape[0]):
-            row[e] = (y[o] - (row[e] + lev[e])) / scale
-        squares, by = ratio[o], 1.0 / (FREEDOM * width * width)
-        for e in range(row.shape[0]):
-            row[e] = _bounded(row[e])
-            squares[e] = row[e] * row[e] * by
-
-
-@njit(types.void(_F, _F, _A1, _A1, _A1, _A1, _A1), **_INNER)
-def _follow_tails(z, since, rates, freedoms, constants, log_scale, evidence):
-    """See ``ScaleMixture.observe``."""
-    most, fastest = -np.inf, 0.5 / (1.0 + since / 4.0)
-    for t in range(rates.shape[0]):
-        nu = freedoms[t]
-        r = (z / math.exp(log_scale[t])) ** 2
-        density = constants[t] - log_scale[t] - 0.5 * (nu + 1.0) * math.log1p(r / nu)
-        evidence[t] = MEMORY * evidence[t] + density
-        most = max(most, evidence[t])
-        moved = log_scale[t] + max(rates[t], fastest) * ((nu + 1.0) * r / (nu + r) - 1.0)
-        log_scale[t] = min(max(moved, -LARGEST), LARGEST)
-    for t in range(rates.shape[0]):
-        evidence[t] -= most
-
-
-@njit(
-    types.void(
-        _ON, _A2, _A2, _A2, _A2, _A1, _A2, _A2, _A2, _A2, _A1, _A1, _A1, _A1, _A1, _A2, _A2, _A1
-    ),
-    **_COMMON,
-)  # fmt: skip
-def fold_fleet(
-    on, far, ratio, figures, experts, prior, evidence, innovation, level, trend, inflation, count,
-    rates, freedoms, constants, log_scale, tail_evidence, nis,
-):  # fmt: skip
-    """Take one sample per model in, where ``on``.
-
-    ``ratio`` is ``log(1 + ratio)`` now; it becomes the logarithm of the experts' weights, 0 at the largest.
-    ``on`` becomes false where models are too young to be judged.
-
-    Args:
-        constants: log densities of the tails' laws at 0, at scale 1.
-    """
-    B, n = count.shape[0], experts.shape[1]
-    m = far.shape[0] // B
-    rho, beta, cap = experts[2], experts[3], experts[4]
-    for b in range(B):
-        nis[b], since = 0.0, max(count[b] - YOUNG, 0.0)
-        rate = max(1.0 / (since + 2.0), RATE)
-        judged = on[b] and count[b] >= YOUNG
-        if on[b]:
-            count[b] += 1.0
-        on[b] = judged
-        for o in range(b * m, (b + 1) * m):
-            z, scale = figures[o, _Z], figures[o, _SCALE]
-            if judged:
-                w, lev, tre, ev, row, logs = innovation[o], level[o], trend[o], evidence[o], far[o], ratio[o]
-                most = -np.inf
-                for e in range(n):
-                    ev[e] = MEMORY * ev[e] - 0.5 * (FREEDOM + 1.0) * logs[e]
-                for e in range(n):
-                    most = max(most, ev[e])
-                for e in range(n):
-                    ev[e] = max(ev[e] - most, LEAST)
-                for e in range(n):
-                    a = row[e] / cap[e]
-                    w[e] = scale * row[e] / (1.0 + a * a)
-                for e in range(n):
-                    tre[e] = TREND_DECAY * tre[e] + beta[e] * w[e]
-                for e in range(n):
-                    lev[e] = LEVEL_DECAY * lev[e] + rho[e] * w[e]
-                for e in range(n):
-                    lev[e] += tre[e]
-                    if not abs(lev[e]) <= FARTHEST * scale:
-                        lev[e] = tre[e] = 0.0
-                most = -np.inf
-                for e in range(n):
-                    logs[e] = prior[e] + ev[e]
-                for e in range(n):
-                    most = max(most, logs[e])
-                for e in range(n):
-                    logs[e] -= most
-                square = min(z * z, SQUARE_MOST * inflation[o])
-                inflation[o] = max(inflation[o] + rate * (square - inflation[o]), 1e-12)
-                _follow_tails(z, since, rates, freedoms, constants, log_scale[o], tail_evidence[o])
-            nis[b] += z * z / inflation[o] / m
-
-
-@njit(types.void(_ON, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1), **_COMMON)
-def settle_fleet(on, p, experts, innovation, level, mass, shift, spread, gain, offset):
-    """What queries need of the experts, from weights p that do not sum to 1 yet, see ``_settle``."""
-    h, kappa, n_groups = experts[0], experts[1], mass.shape[1]
-    each, m = experts.shape[1] // n_groups, p.shape[0] // on.shape[0]
-    n_shares = n_groups // gain.shape[1]
-    for o in range(p.shape[0]):
-        if not on[o // m]:
+    B, d, m, n_learners = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0]
+    far, p, inside = np.empty(g[G.N_EXPERTS]), np.empty(g[G.N_EXPERTS]), np.empty(m)
+    mean, noise, t, found = np.empty(m), np.empty(m), np.empty(m), np.empty(4)
+    total = 0
+    for i in range(n_learners):
+        if members[i, P.MODELS]:
+            total += B * (gp.values_of(members[i]) + members[i, P.WIDTH] + 2 * members[i, P.SLOTS] + 1)
+    room, at = np.empty(total), 0  # what is found for predictions serves the update
+    gp.grow_largest(g, on, y)
+    for i in range(n_learners):
+        a = members[i]
+        if not a[P.MODELS]:
             continue
-        row, w, lev, total = p[o], innovation[o], level[o], 0.0
-        for e in range(row.shape[0]):
-            total += row[e]
-        for i in range(gain.shape[1]):
-            gain[o, i] = 0.0
-        offset[o] = 0.0
-        for g in range(n_groups):
-            held, carried, apart = 0.0, 0.0, 0.0
-            for e in range(g * each, (g + 1) * each):
-                held += row[e]
-                carried += row[e] * (lev[e] - kappa[e] * w[e])
-            middle = carried / max(held, _TINY)
-            for e in range(g * each, (g + 1) * each):
-                apart += row[e] * (lev[e] - kappa[e] * w[e] - middle) ** 2
-            mass[o, g], shift[o, g], spread[o, g] = held / total, middle, apart / total
-            gain[o, g // n_shares] += held / total * h[g * each]
-            offset[o] += carried / total
+        n, W, M = gp.values_of(a), a[P.WIDTH], a[P.SLOTS]
+        psi, phi = np.empty(M), np.empty(M)
+        for b in range(B):
+            values, q = room[at : at + n], room[at + n : at + n + W]
+            k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
+            prior = gp.look(a, b, vector_at(x, b, d), values, q, k, psi, phi)
+            v = gp.mean_and_variance(a, b, prior, k, Ck, mean)
+            gp.cut(a, b, mean, inside)
+            gp.noise_of(a, b, noise)
+            scale = vector_at(a[P.SCALE_Y], b * a[P.OWN_UNITS], m)
+            for o in range(m):
+                means[b * m + o, i] = mean[o]
+                noisy[b * m + o, i] = v * scale[o] * scale[o] + noise[o]
+            room[at + n + W + 2 * M] = prior
+            at += n + W + 2 * M + 1
+    for b in range(B):
+        count, nis = vector_at(g[G.COUNT], b, 1), 0.0
+        for r in range(b * m, (b + 1) * m):
+            make_finite(g, r, means[r], noisy[r])
+            judged = on[b] and count[0] >= E.YOUNG
+            since = max(count[0] - E.YOUNG, 0.0)
+            nis += judge(g, r, vector_at(y, r, 1)[0], judged, since, means[r], noisy[r], far, p) / m
+        if on[b]:
+            count[0] += 1.0
+        of_all[0, b] = nis
+    at, alarm = 0, 0
+    for i in range(n_learners):
+        a = members[i]
+        if not a[P.MODELS]:
+            continue
+        n, W, M = gp.values_of(a), a[P.WIDTH], a[P.SLOTS]
+        for b in range(B):
+            values, q = room[at : at + n], room[at + n : at + n + W]
+            k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
+            if on[b] and turns[i, P.MODE] != P.SKIP:
+                prior = room[at + n + W + 2 * M]
+                events[i, b] = gp.learn(
+                    a, b, values, q, k, Ck, prior, vector_at(y, b, m), t, found, errors[i, b]
+                )
+                for r in range(4):
+                    figures[i, r, b] = found[r]
+            at += n + W + 2 * M + 1
+        if gp.note(a, turns[i], on, x, y, figures[i], errors[i]):
+            alarm |= 1 << i
+    _of_all(g, figures, of_all)
+    return alarm
 
 
-@njit(types.void(_A2, _A2, _A2, _A2, _A2, _A2, _A2, _A2, _A1, _A1, _A1, _A2), **_COMMON)
-def combine_fleet(means, latent, noisy, experts, gain, mass, shift, spread, offset, inflation, largest, out):
-    """Mean and deviations of g and of y in the rows of ``out``, see ``MixtureResidual.predict``.
+@njit(types.void(I1, I2, INT, INT, INT, INT, INT, INT, INT), **COMMON)
+def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
+    """One query per model; results by their addresses (0: not wanted), see ``MixtureResidual``.
 
     Args:
-        means, latent, noisy: of the learners' predictions, variances of g and of y.
+        variance, deviation: of g.
+        standard: deviation of y by which innovations are standardised.
+        J, dv: derivatives of mean and variance by x.
     """
-    n_learners = means.shape[1]
-    n_shares, each = mass.shape[1] // n_learners, experts.shape[1] // mass.shape[1]
-    for o in range(means.shape[0]):
-        mean, variance, scatter = offset[o], 0.0, 0.0
-        for i in range(n_learners):
-            mean += gain[o, i] * means[o, i]
-        mean = min(max(mean, -largest[o]), largest[o])
-        for i in range(n_learners):
-            for s in range(n_shares):
-                g = i * n_shares + s
-                h, p = experts[0, g * each], mass[o, g]
-                scatter += p * noisy[o, i]
-                variance += p * (h * h * latent[o, i] + (h * means[o, i] + shift[o, g] - mean) ** 2)
-                variance += spread[o, g]
-        scatter = math.sqrt(scatter) * math.sqrt(inflation[o])
-        out[0, o], out[1, o], out[2, o] = mean, min(math.sqrt(variance), scatter), scatter
+    B, d, m, n = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0]
+    n_shares, n_experts = g[G.N_SHARES], g[G.N_EXPERTS]
+    with_variance, rows = variance != 0 or deviation != 0 or standard != 0, m if J else 0
+    rows_dv = m if dv else 0
+    h = matrix_at(g[G.EXPERTS], 0, 5, n_experts)[0]
+    each = n_experts // (n * n_shares)
+    means, latent, noisy = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
+    J_of, dv_of = np.empty((n, rows, d)), np.empty((n, rows_dv, d))
+    one, v, noise = np.empty(m), np.empty(m), np.zeros(m)
+    for b in range(B):
+        for i in range(n):
+            gp.query(members[i], b, with_variance, vector_at(x, b, d), one, v, J_of[i], dv_of[i])
+            if with_variance:
+                gp.noise_of(members[i], b, noise)
+            for o in range(m):
+                means[o, i], latent[o, i], noisy[o, i] = one[o], v[o], v[o] + noise[o]
+        for o in range(m):
+            r = b * m + o
+            make_finite(g, r, means[o], latent[o])
+            make_finite(g, r, means[o], noisy[o])
+            free, most = mean_of(g, r, means[o]), FARTHEST_MEAN * vector_at(g[P.LARGEST], r, 1)[0]
+            value = min(max(free, -most), most)
+            vector_at(mean, r, 1)[0] = value
+            gain = vector_at(g[G.GAIN], r, n)
+            if rows:
+                to = vector_at(J, r, d)
+                to[:] = 0.0
+                if free == value:
+                    for i in range(n):
+                        for j in range(d):
+                            s = J_of[i, o, j]
+                            to[j] += gain[i] * s if math.isfinite(s) else 0.0
+            if not with_variance:
+                continue
+            mass, shift = vector_at(g[G.MASS], r, n * n_shares), vector_at(g[G.SHIFT], r, n * n_shares)
+            spread, total = vector_at(g[G.SPREAD], r, n * n_shares), 0.0
+            for k in range(n * n_shares):
+                i, share = k // n_shares, h[k * each]
+                apart = share * means[o, i] + shift[k] - value
+                total += mass[k] * (share * share * latent[o, i] + apart * apart) + spread[k]
+            scatter = scatter_of(g, r, noisy[o])
+            bound = scatter * vector_at(g[G.INFLATION], r, 1)[0]
+            if standard:
+                vector_at(standard, r, 1)[0] = math.sqrt(scatter)
+            if deviation:
+                vector_at(deviation, r, 1)[0] = math.sqrt(min(total, bound))
+            if variance:
+                vector_at(variance, r, 1)[0] = min(total, bound)
+            if rows_dv:
+                to = vector_at(dv, r, d)
+                to[:] = 0.0
+                for k in range(n * n_shares):
+                    i, share = k // n_shares, h[k * each]
+                    apart = share * means[o, i] + shift[k] - value
+                    by_v, by_m = mass[k] * share * share, 2.0 * mass[k] * apart * share
+                    if total > bound:
+                        by_v, by_m = mass[k] * vector_at(g[G.INFLATION], r, 1)[0], 0.0
+                    for j in range(d):
+                        s, f = dv_of[i, o, j], J_of[i, o, j]
+                        to[j] += by_v * (s if math.isfinite(s) else 0.0) + by_m * (
+                            f if math.isfinite(f) else 0.0
+                        )

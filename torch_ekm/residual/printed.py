@@ -21,13 +21,13 @@ def numbers(values: Tensor) -> str:
 
 def kernel_in_words(kernel: nn.Module) -> str:
     """``Matern32: lengthscale 2, variance 1``; of a deep kernel its network, too."""
-    base = getattr(kernel, "base", kernel)
+    base: Any = getattr(kernel, "base", kernel)
     network = ""
     if base is not kernel:
         weights: Any = kernel.weights
         widths = [weights[0].shape[-2], *(weight.shape[-1] for weight in weights)]
         network = " and a network " + "-".join(map(str, widths))
-    values = ((name.split(".")[-1], p) for name, p in base.named_parameters())
+    values = ((name.split(".")[-1], p) for name, p in base.hyperparameters().items())
     figures = ", ".join(f"{n.removeprefix('log_').replace('_', ' ')} {numbers(p.exp())}" for n, p in values)
     return f"{type(base).__name__}{network}: {figures}"
 

@@ -12,7 +12,44 @@ from ..typing import Float, Tensor
 
 MEMORY = 0.99  #: forgetting factor of the evidence
 _RATES, _FREEDOMS = (0.02, 0.06, 0.2), (2.0, 4.0, 30.0)
+_BISECTIONS = 52  # of an interval: as many as a double has digits
 LARGEST = 14.0  # of the logarithm of a scale: a noise-free stream must not end in 0/0
+
+
+class EvenStudentT(StudentT):
+    """Student's t of an even number nu of degrees of freedom, whose cdf is a sum::
+
+    F(t) = 1/2 + s/2 sum_{k < nu/2} a_k (1 - s^2)^k,   s = t / sqrt(nu + t^2),   a_0 = 1
+    a_k = a_{k-1} (2k - 1)/(2k)
+    """
+
+    def cdf(self, value: Float[Tensor, "*any"]) -> Float[Tensor, "*any"]:
+        """P(y <= value)."""
+        t = (value - self.loc) / self.scale
+        s = t / (self.df + t.square()).sqrt()
+        term, total = torch.ones_like(s), torch.zeros_like(s)
+        for k in range(int(self.df.max()) // 2):
+            total = total + torch.where(2 * k < self.df, term, 0.0)
+            term = term * (self.df / (self.df + t.square())) * (2 * k + 1) / (2 * k + 2)
+        return 0.5 + 0.5 * s * total
+
+
+class ScaleMixtureLaw(MixtureSameFamily):
+    """A weighted mean of Student t laws about one mean, with quantiles."""
+
+    def icdf(self, value: Tensor | float) -> Float[Tensor, "*any"]:
+        """The value that y exceeds with probability ``1 - value``, by bisection to rounding."""
+        t = self.component_distribution
+        p = torch.as_tensor(value, dtype=t.loc.dtype, device=t.loc.device)
+        # no t law of two or more degrees of freedom lies farther out than that of two
+        far = (2.0 * p - 1.0).abs() / (2.0 * p * (1.0 - p)).sqrt()
+        middle, width = t.loc[..., 0], far * t.scale.amax(-1)
+        low, high = middle - width, middle + width
+        for _ in range(_BISECTIONS):
+            half = 0.5 * (low + high)
+            below = self.cdf(half) < p
+            low, high = torch.where(below, half, low), torch.where(below, high, half)
+        return 0.5 * (low + high)
 
 
 class ScaleMixture(nn.Module):
@@ -47,12 +84,14 @@ class ScaleMixture(nn.Module):
         self.log_scale = nn.Buffer(torch.zeros(shape, **factory))
         self.evidence = nn.Buffer(torch.zeros(shape, **factory))
 
-    def law(self, mean: Float[Tensor, "*any out"], deviation: Float[Tensor, "*any out"]) -> MixtureSameFamily:
+    def law(self, mean: Float[Tensor, "*any out"], deviation: Float[Tensor, "*any out"]) -> ScaleMixtureLaw:
         """The law of y = mean + deviation z. Its variance is infinite (some experts have nu = 2)."""
         deviation = deviation.unsqueeze(-1)
-        t = StudentT(self.freedoms, mean.unsqueeze(-1), deviation * self.log_scale.exp(), validate_args=False)
+        t = EvenStudentT(
+            self.freedoms, mean.unsqueeze(-1), deviation * self.log_scale.exp(), validate_args=False
+        )
         logits = self.evidence.expand(t.batch_shape)
-        return MixtureSameFamily(Categorical(logits=logits, validate_args=False), t, validate_args=False)
+        return ScaleMixtureLaw(Categorical(logits=logits, validate_args=False), t, validate_args=False)
 
     def typical(self) -> Float[Tensor, "*batch out"]:
         """Scale of z in which outliers have little say: geometric mean of the experts'."""

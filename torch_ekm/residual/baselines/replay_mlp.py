@@ -10,7 +10,8 @@ from torch import nn
 from ..._checks import check_count, check_counts
 from ...typing import Tensor
 from ..adam import Adam
-from ..base import SingleLearner
+from ..kernels.kernel import BufferList
+from ..kinds import SingleLearner
 from ..report import UpdateReport
 from .scaled import ScaledLearner
 
@@ -53,11 +54,11 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         self.targets = nn.Buffer(zeros(self.memory, self.out_features))
         self.count = nn.Buffer(torch.zeros((), dtype=torch.int64, device=self.device))
         self.noise = nn.Buffer(zeros(self.out_features))
-        self.theta = nn.ParameterList()
+        self.theta = BufferList()
         widths = [self.in_features, *self.hidden, self.out_features]
         for n_in, n_out in itertools.pairwise(widths):
-            self.theta.append(nn.Parameter(zeros(self.members, n_in, n_out), requires_grad=False))
-            self.theta.append(nn.Parameter(zeros(self.members, 1, n_out), requires_grad=False))
+            self.theta.append(zeros(self.members, n_in, n_out))
+            self.theta.append(zeros(self.members, 1, n_out))
         for i, p in enumerate(self.theta):
             self.register_buffer(f"start_{i}", torch.zeros_like(p))
         self.adam = Adam(self.theta)

@@ -148,7 +148,8 @@ class ScaledLearner(ResidualLearner):
         self.n_samples += 1
         z = self._inputs(x)
         t = self.output(y) if self.standardize else y
-        misled = self.misled.observe(t - self._mean(z), t, mask)
+        self.misled.observe(t - self._mean(z), t, mask)
+        misled = self.misled.found()
         if misled is not None:
             self._clear(misled)
             if self.standardize:

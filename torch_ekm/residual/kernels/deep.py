@@ -4,12 +4,11 @@ import itertools
 from collections.abc import Sequence
 
 import torch
-from torch import nn
 
 from ..._checks import check_count, check_counts
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-from .kernel import Kernel, Pullback
+from .kernel import BufferList, Kernel, Pullback
 from .stationary import StationaryKernel, squared_distances
 
 _INITIAL_SCALE = 0.3  # of the features at the start, relative to an ordinary initialisation
@@ -46,15 +45,15 @@ class DeepKernel(Kernel):
         like = base.log_lengthscale
         fleet, generator = like.shape[:-1], torch.Generator().manual_seed(seed)
         widths = [like.shape[-1], *check_counts("hidden", hidden), check_count("features", features)]
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        self.weights, self.biases = BufferList(), BufferList()
         for layer, (n_in, n_out) in enumerate(itertools.pairwise(widths)):
             scale = (_INITIAL_SCALE if layer == len(widths) - 2 else 1.0) / n_in**0.5
             # every model of a fleet starts with the same weights, as a single model would
             weight = scale * torch.randn(n_in, n_out, generator=generator, dtype=torch.float64)
             weight = weight.to(like).expand(*fleet, n_in, n_out).contiguous()
-            self.weights.append(nn.Parameter(weight, requires_grad=False))
+            self.weights.append(weight)
             if layer < len(widths) - 2:  # a constant in the features has no effect
-                self.biases.append(nn.Parameter(like.new_zeros(*fleet, n_out), requires_grad=False))
+                self.biases.append(like.new_zeros(*fleet, n_out))
 
     def net(self, x: Float[Tensor, "*any n d"]) -> Float[Tensor, "*batch n features"]:
         """The features of x that the network has learned, near 0 at the start."""

@@ -2,15 +2,16 @@
 
 A kernel gives four things: the matrix ``k(X, Z)``, its diagonal ``k(x, x)``, and the derivatives
 of both with respect to a query x. Hyperparameters are logarithms with the shape of the fleet in
-front, ``(*batch_shape, ...)``; they are Parameters without ``requires_grad``, since only the
-learner's own adaptation moves them (a plain optimiser would leave its caches stale).
+front, ``(*batch_shape, ...)``; they are buffers, since only the learner's own adaptation moves them (an
+optimiser would leave its caches stale).
 """
 
 from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import cast
 
 import torch
 from torch import nn
@@ -20,7 +21,7 @@ from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
 
-#: derivatives by :meth:`~torch.nn.Module.parameters` from those by ``k(x_i, x_j)`` and ``k(x_i, x_i)``
+#: derivatives by :meth:`Kernel.hyperparameters` from those by ``k(x_i, x_j)`` and ``k(x_i, x_i)``
 Pullback = Callable[[Tensor, Tensor], Sequence[Tensor | None]]
 
 
@@ -28,8 +29,13 @@ class Kernel(Recorded, nn.Module, ABC):
     """A covariance function k(x, z) of two points, with its derivative by the first.
 
     A kernel of your own implements ``forward``, ``diagonal`` and ``with_gradient``, and ``diagonal_gradient``
-    unless k(x, x) is constant. Its hyperparameters are Parameters without ``requires_grad``.
+    unless k(x, x) is constant. Its hyperparameters are its buffers.
     """
+
+    def hyperparameters(self) -> dict[str, Tensor]:
+        """What is learned of it, by name: its floating-point buffers, and parameters where it has any."""
+        found = [*self.named_parameters(), *self.named_buffers()]
+        return {name: t for name, t in found if t.is_floating_point()}
 
     @abstractmethod
     def forward(self, x: Float[Tensor, "*batch n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
@@ -56,12 +62,12 @@ class Kernel(Recorded, nn.Module, ABC):
 
         Here by autograd; a kernel with a closed form overrides it.
         """
-        twin = copy.deepcopy(self).requires_grad_(True)  # another thread may query the kernel itself
+        twin = copy.deepcopy(self)  # another thread may query the kernel itself
+        parameters = [p.requires_grad_(True) for p in twin.hyperparameters().values()]
         with torch.enable_grad():
             found = twin(x[..., :rows, :], x), twin.diagonal_of_set(x)
 
         def pullback(by_matrix: Tensor, by_diagonal: Tensor) -> Sequence[Tensor | None]:
-            parameters = list(twin.parameters())
             if not parameters:
                 return ()
             return torch.autograd.grad(found, parameters, [by_matrix, by_diagonal], allow_unused=True)
@@ -93,9 +99,26 @@ class Kernel(Recorded, nn.Module, ABC):
         return [False] * in_features
 
 
+class BufferList(nn.Module):
+    """Buffers one after the other, named by their places."""
+
+    def append(self, values: Tensor) -> None:
+        """One more at the end."""
+        self.register_buffer(str(len(self)), values)
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return iter(cast("dict[str, Tensor]", self._buffers).values())
+
+    def __len__(self) -> int:
+        return len(self._buffers)
+
+    def __getitem__(self, place: int) -> Tensor:
+        return list(self)[place]
+
+
 def log_parameter(
     name: str, value: float | Sequence[float] | Tensor, shape: tuple[int, ...], **factory
-) -> nn.Parameter:
+) -> nn.Buffer:
     """``log(value)``, broadcast to ``shape``.
 
     Raises:
@@ -111,7 +134,7 @@ def log_parameter(
         values = values.expand(shape)
     except RuntimeError:
         raise ParameterError(name, values.tolist(), f"one number or of shape {tuple(shape)}") from None
-    return nn.Parameter(values.log().contiguous(), requires_grad=False)
+    return nn.Buffer(values.log().contiguous())
 
 
 def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...]) -> Kernel:
@@ -139,6 +162,6 @@ def is_shared(kernel: Kernel, in_features: int) -> bool:
 
 
 def _shape_of(kernel: Kernel, in_features: int) -> tuple[int, ...]:
-    like = next(kernel.parameters(), torch.empty(0, dtype=torch.float64))
+    like = next(iter(kernel.hyperparameters().values()), torch.empty(0, dtype=torch.float64))
     x = like.new_zeros(1, in_features)
     return tuple(kernel(x, x).shape[:-2])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ..._checks import check_fraction
-from ...exceptions import ParameterError
+from ..._checks import check_fraction, check_share
 from .part import Host, Part
 
 
@@ -57,9 +56,7 @@ class ProcessNoise(Part):
 
     def __init__(self, share: float) -> None:
         super().__init__()
-        self.share = check_fraction("share", share)
-        if self.share == 1:
-            raise ParameterError("share", share, "in (0, 1)")
+        self.share = check_share("share", share)
 
     def on_rebuild(self, learner: Host) -> None:
         """Wander by the samples since the last rebuild."""

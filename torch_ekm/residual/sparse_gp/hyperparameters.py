@@ -13,6 +13,7 @@ from ...typing import Bool, Float, Tensor
 from ..adam import Adam
 from ..kernels.kernel import is_shared
 from ..running_scale import write
+from . import plan as P
 from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import DetectChanges, RobustWeight
 from .part import Host, Part, Sample
@@ -80,7 +81,7 @@ class LearnHyperparameters(Part):
         self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
-        parameters = [*learner.kernel.parameters(), learner.log_noise_variance]
+        parameters = [*learner.kernel.hyperparameters().values(), learner.log_noise_variance]
         self.adam = Adam(parameters, betas=(0.9, 0.99))
         for i, p in enumerate(parameters):
             self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
@@ -89,10 +90,28 @@ class LearnHyperparameters(Part):
             horizon = min(horizon, self.memory)
         self.past = ReplayMemory(posterior, self.memory, horizon) if self.memory else None
 
+    def compiled(self) -> dict[int, Tensor | int]:
+        """Where compiled loops keep samples, see :mod:`.plan`."""
+        fields: dict[int, Tensor | int] = {
+            P.WINDOW_X: self.window_x, P.WINDOW_Y: self.window_y, P.WINDOW: self.window_on,
+            P.WINDOW_SIZE: self.window,
+        }  # fmt: skip
+        if self.past is not None:
+            fields |= {
+                P.PAST_X: self.past.x, P.PAST_Y: self.past.y, P.PAST: self.past.weight,
+                P.PAST_ABSORBED: self.past.absorbed, P.PAST_NUMBER: self.past.number,
+                P.PAST_SIZE: self.past.capacity,
+            }  # fmt: skip
+        return fields
+
+    def places(self, n: int, learner: Host) -> tuple[int, int]:
+        """Of the sample after n, in the window and the memory (-1: none)."""
+        place = (n - learner.refresh_offset) % self.window
+        return place, -1 if self.past is None else self.past.next_place()
+
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Keep the sample, in its own units; with a full window, descend."""
-        n = learner.n_samples
-        place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
+        place = (learner.n_samples - learner.refresh_offset) % self.window
         x, y, weight = sample.x, sample.y, sample.report.weight
         weight = weight if sample.mask is None else weight * sample.mask
         write(self.window_x, place, x)
@@ -100,6 +119,13 @@ class LearnHyperparameters(Part):
         self.window_on.select(-1, place).copy_(weight)
         if self.past is not None:
             self.past.offer(x, y, weight)
+        self.act(learner)
+        return False
+
+    def act(self, learner: Host) -> None:
+        """After the notes of a sample: descend, and move the parameters, when it is time."""
+        n = learner.n_samples
+        place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
         between = (place + 1) * self.steps // self.window > place * self.steps // self.window
         if due or (between and place + 1 < self.window):
             if moved := due and self.steps > 1:
@@ -107,7 +133,6 @@ class LearnHyperparameters(Part):
             self.descend(learner, moved=moved)
         if due:
             self._move(learner)
-        return False
 
     def after_rebuild(self, learner: Host) -> None:
         """The present state becomes the past one; the window is empty."""
@@ -144,7 +169,7 @@ class LearnHyperparameters(Part):
         return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
     def _theta(self, learner: Host) -> dict[str, Tensor]:
-        return {**dict(learner.kernel.named_parameters()), "log_noise": learner.log_noise_variance}
+        return {**learner.kernel.hyperparameters(), "log_noise": learner.log_noise_variance}
 
     def descend(self, learner: Host, *, moved: bool = False) -> None:
         """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.

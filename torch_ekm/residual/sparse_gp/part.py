@@ -13,8 +13,8 @@ from torch import nn
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
-from ..base import DoubleStateLearner
 from ..kernels.kernel import Kernel
+from ..kinds import DoubleStateLearner
 from ..report import UpdateReport
 from ..running_scale import RunningScale
 from .posterior import SparsePosterior
@@ -117,7 +117,7 @@ class Host(DoubleStateLearner):
     """What a part finds in its learner: the state, and how it is forgotten and learned again."""
 
     kernel: Kernel
-    log_noise_variance: nn.Parameter
+    log_noise_variance: Tensor
     posterior: SparsePosterior
     units: Units
     engine: Any
@@ -143,6 +143,13 @@ class Host(DoubleStateLearner):
         In :meth:`Part.bind` it is looked for among those before.
         """
         return next((part for part in self._parts if isinstance(part, kind)), None)
+
+    parts: nn.ModuleList
+    """All of them, in the order in which they act."""
+
+    @abstractmethod
+    def count_sample(self, *, anew: bool = False) -> None:
+        """After a sample and all notes of it: rebuild the caches when it is time, or at once."""
 
     def is_due(self, n: int) -> bool:
         """Whether parts may change the state, and the caches are rebuilt, after n samples."""

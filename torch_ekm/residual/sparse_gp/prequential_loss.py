@@ -79,7 +79,7 @@ class PrequentialLoss(nn.Module):
     ) -> tuple[Tensor, list[Tensor | None]]:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], derivatives of their sum.
 
-        The derivatives are those by ``[*kernel.parameters(), log_noise]``, at the values by which the old
+        The derivatives are by the kernel's hyperparameters and log_noise, at the values by which the old
         state's caches were made, or, with ``anew``, are made here.
         """
         M, alpha = self.state.basis.shape[-2], self.state.alpha

@@ -41,14 +41,23 @@ class ReplayMemory(nn.Module):
 
     def offer(self, x: Tensor, y: Tensor, weight: Tensor) -> None:
         """A sample per model with its weight in the update, 0 where there was none."""
-        n = self._n_offered
-        self._n_offered += 1
-        place = n if n < self.capacity else _scattered(n) % math.ceil(min(n + 1, self.horizon))
-        if place < self.capacity:
+        n, place = self._n_offered, self.next_place()
+        self.count()
+        if place >= 0:
             write(self.x, place, x)
             write(self.y, place, y)
             self.weight.select(-1, place).copy_(weight)
             self.absorbed[place], self.number[place] = 0.0, n
+
+    def next_place(self) -> int:
+        """The place of the next sample; -1: there is none for it."""
+        n = self._n_offered
+        place = n if n < self.capacity else _scattered(n) % math.ceil(min(n + 1, self.horizon))
+        return place if place < self.capacity else -1
+
+    def count(self) -> None:
+        """The next sample was offered."""
+        vars(self)["_n_offered"] += 1  # an assignment to a Module takes ten times as long
 
     def settle(self) -> None:
         """All that is kept is now part of the state that is to predict it."""

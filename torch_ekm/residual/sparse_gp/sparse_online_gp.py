@@ -188,31 +188,40 @@ class SparseOnlineGP(Host):
         """See :meth:`ResidualLearner.update`; single samples that the engine accepts skip its checks."""
         if mask is None:
             with self.lock:
-                if self.engine.accepts(self, x, y):
-                    return self.step(x, y, None)
+                report = self.engine.learn(self, x, y, None)
+                if report is not None:
+                    return report
         return super().update(x, y, mask)
 
     @torch.no_grad()
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        report = self.engine.learn(self, x, y, mask)
+        if report is not None:
+            return report
         on = None if mask is None else mask.to(x.dtype)
         for part in self._preparing:
             part.before_update(self, x, y, on)
         done = self.engine.absorb(self, x, y, on)
-        n = self.n_samples + 1
-        if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
-            anew = self.is_due(n)
-        else:
-            every = max(self.refresh_every // 4, 1) if self.drifts else self.refresh_every
-            anew = n % every == 0 and self._is_stale(n)
+        anew = False
         if self._noting:
             sample = Sample(x, y, on, done.innovation, done.variance, done.report)
             for part in self._noting:
                 anew |= part.after_update(self, sample)
         self.pending.add_(1.0 if on is None else on)  # += would register the buffer again
-        self.n_samples = n
+        self.count_sample(anew=anew)
+        return done.report
+
+    def count_sample(self, *, anew: bool = False) -> None:
+        """After a sample and all notes of it: rebuild the caches when it is time, or at once."""
+        n = self.n_samples + 1
+        if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
+            anew |= self.is_due(n)
+        else:
+            every = max(self.refresh_every // 4, 1) if self.drifts else self.refresh_every
+            anew |= n % every == 0 and self._is_stale(n)
+        vars(self)["n_samples"] = n  # an assignment to a Module takes ten times as long
         if anew:
             self.refresh()
-        return done.report
 
     def _is_stale(self, n: int) -> bool:
         """Whether the caches must be made again after n samples although no part changed the state."""

@@ -9,6 +9,7 @@ from ..._checks import check_sizes
 from ...exceptions import ParameterError
 from ...typing import Tensor
 from ..running_scale import ALIEN, BLOCK, RunningScale
+from . import plan as P
 from .part import Host, Part, Units
 
 _DOUBLING = 1024  # samples up to which units are adopted after 1, 2, 4, 8, ... samples, too
@@ -61,10 +62,26 @@ class Standardize(Part):
         self.output = RunningScale(learner.out_features, centred, least=least, **fleet)
         learner.units = Units(self.input, self.output, centred=self.output_offset == "learned")
 
+    def compiled(self) -> dict[int, Tensor | int]:
+        """Where compiled loops keep samples, see :mod:`.plan`."""
+        x, y = self.input, self.output
+        return {
+            P.BLOCK: x.block, P.BLOCK_ON: x.block_on, P.BLOCK_Y: y.block, P.BLOCK_ON_Y: y.block_on,
+            P.BLOCK_SIZE: BLOCK,
+        }  # fmt: skip
+
+    def place(self, n: int, learner: Host) -> int:
+        """Of the sample after n in the block, which is full just before a rebuild."""
+        return n if n < BLOCK else (n - learner.refresh_offset) % BLOCK
+
+    def acts_before(self, n: int, learner: Host) -> bool:
+        """Whether it does more before the sample after n than keep it."""
+        return n == BLOCK or self.place(n, learner) == BLOCK - 1 or (n & (n + 1) == 0 and n < _DOUBLING)
+
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         """Take the sample in; while units are rough, adopt them before it is learned."""
         n = learner.n_samples
-        place = n if n < BLOCK else (n - learner.refresh_offset) % BLOCK  # full just before a rebuild
+        place = self.place(n, learner)
         if n == BLOCK and place > 0:  # what is behind was pooled already
             self.input.block_on.zero_()
             self.output.block_on.zero_()

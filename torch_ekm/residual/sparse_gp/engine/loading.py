@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import importlib.util
 import os
 import subprocess
@@ -12,6 +14,16 @@ from types import ModuleType
 from ...._warnings import warn
 from ....exceptions import SpeedWarning
 
+_LAST = "torch_ekm.residual.numba_mixture"  #: of the modules of loops, which imports the others
+_SOURCES = (
+    "**/numba_*.py",
+    "**/*plan.py",
+    "sparse_gp/monitor.py",
+    "**/recursion.py",
+    "experts.py",
+    "tails.py",
+    "misled.py",
+)
 _OFF = (
     "compiled loops are off, so learners take longer: {}; if numba cannot write its cache, set "
     "NUMBA_CACHE_DIR to a folder that can be written"
@@ -66,7 +78,8 @@ def load_loops(*, wait: bool = False) -> ModuleType | None:
 
 def _imported() -> ModuleType | None:
     try:
-        from . import numba_network
+        _is_cached()
+        return importlib.import_module(_LAST)
     except ImportError as error:
         if error.name not in ("numba", "llvmlite"):  # it is there, and does not fit
             warn(_OFF.format(error), SpeedWarning)
@@ -74,16 +87,23 @@ def _imported() -> ModuleType | None:
     except RuntimeError as error:
         warn(_OFF.format(error), SpeedWarning)
         return None
-    return numba_network
 
 
 def _is_cached() -> bool:
-    """Whether numba has compiled the last of the loops since the file was written, as far as one can see."""
+    """Whether what numba made of the last of the loops is there, as far as one can see.
+
+    Numba looks at the file of a loop alone: what it made before any of the files changed goes.
+    """
     from numba.misc.appdirs import user_cache_dir
 
-    source = Path(__file__).with_name("numba_network.py")
-    name = f"numba_network.embed_fleet-*.py{sys.version_info.major}{sys.version_info.minor}.nbi"
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    folders = [Path(given)] if given else [source.parent, Path(user_cache_dir("numba", False))]
-    found = (index for folder in folders for index in folder.glob(f"*/{name}"))
-    return any(index.stat().st_mtime >= source.stat().st_mtime for index in found)
+    source, given = Path(__file__).parents[2], os.environ.get("NUMBA_CACHE_DIR")
+    sources = [file for pattern in _SOURCES for file in source.glob(pattern)]
+    written = max(file.stat().st_mtime for file in sources)
+    names = [f"{file.stem}.*.py{sys.version_info.major}{sys.version_info.minor}.nbi" for file in sources]
+    folders = [Path(given)] if given else [Path(user_cache_dir("numba", False)), *{f.parent for f in sources}]
+    found = {index for folder in folders for name in names for index in folder.glob(f"*/{name}")}
+    for index in (old for old in found if old.stat().st_mtime < written):
+        found = found - {index}
+        with contextlib.suppress(OSError):
+            index.unlink()
+    return any("query_mixture" in index.name for index in found)

@@ -1,10 +1,9 @@
-"""The recursion of a sparse GP and its predictions as compiled loops over a fleet (extra ``fast``).
+"""The recursion of a sparse GP, and its kernels, as compiled loops for one model.
 
-Equations and names are those of :mod:`~torch_ekm.residual.sparse_gp.engine.recursion` and
-:mod:`~torch_ekm.residual.sparse_gp.posterior`, which stay the reference. All arrays are C-contiguous and
-float64, the fleet's axis first; most are views of the learner's buffers and change in place. What all
-models share (a kernel, plain units) has length 1 there. No call holds the GIL, none is parallel: numba
-and other libraries may not share one OpenMP runtime.
+Equations and names are those of :mod:`~torch_ekm.residual.sparse_gp.engine.recursion`,
+:mod:`~torch_ekm.residual.kernels` and :mod:`~torch_ekm.residual.sparse_gp.posterior`, which stay the
+reference. All arrays are C-contiguous and float64, and most are the learner's own memory, changed in place.
+No call holds the GIL, none is parallel: numba and other libraries may not share one OpenMP runtime.
 
 Loops over the last axis touch two or three arrays each: with more the compiler gives up proving that they
 do not overlap, and does not vectorise. Entries are assigned one by one: an assignment of an array to a slice
@@ -19,97 +18,125 @@ import numpy as np
 from numba import njit, types
 
 from ..monitor import DISTRUSTED, DISTRUSTED_MOST, RATE
-from .recursion import TIE, TIE_KL
+from .numba_math import A1, A2, A3, EPS, I1, INNER, INT, TINY, F, exp
+from .recursion import LEAST_NOVELTY, TIE, TIE_KL
 
-#: what a kernel's ``kind`` means; GIVEN: its values come with the call
-SQUARED_EXPONENTIAL, MATERN32, MATERN52, GIVEN = 0, 1, 2, 3
-#: entries of ``flags``
-KIND, ACTIONS = 0, 1
-
-_EPS, _TINY = np.finfo(np.float64).eps, np.finfo(np.float64).tiny
-# NaN and infinity keep their meaning: samples are tested for them in here.
-_COMMON = {
-    "cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-}  # fmt: skip
-_INNER = {**_COMMON, "no_cpython_wrapper": True}  # called from loops alone
-_A1, _A2, _A3, _A4 = (types.Array(types.float64, n, "C") for n in (1, 2, 3, 4))
-_I1, _F = types.Array(types.int64, 1, "C"), types.float64
-_HYPER = (_A2, _A1, _A2)  # log lengthscales, log variance, log action variances
-_UNITS = (_A2, _A2, _A2, _A2, _A1)  # shift and scale of inputs and of outputs, reach of inputs
+#: what a kernel's ``kind`` means
+SQUARED_EXPONENTIAL, MATERN32, MATERN52 = 0, 1, 2
+_FAR = 1e10  # squared scaled distance beyond which a kernel is 0
 
 
-@njit(types.Tuple((_F, _F))(types.int64, _F), **_INNER)
-def _phi_psi(kind, d2):
-    """Correlation and ``-2 dphi/d(d2)`` at a squared scaled distance, see StationaryKernel."""
+@njit(types.void(INT, F, A1, A1, A1), **INNER)
+def _correlations(kind, variance, active, k, psi):
+    """From squared scaled distances in ``k``: k and ``v psi`` at points in use, 0 elsewhere, see
+    StationaryKernel."""
+    n = k.shape[0]
+    for i in range(n):
+        k[i] = min(k[i], _FAR)
     if kind == SQUARED_EXPONENTIAL:
-        phi = math.exp(-0.5 * d2)
-        return phi, phi
-    if kind == MATERN32:
-        r = math.sqrt(3.0 * d2)
-        decay = math.exp(-r)
-        return (1.0 + r) * decay, 3.0 * decay
-    r = math.sqrt(5.0 * d2)
-    decay = math.exp(-r)
-    return (1.0 + r + r * r / 3.0) * decay, (5.0 / 3.0) * (1.0 + r) * decay
+        for i in range(n):
+            k[i] = variance * exp(-0.5 * k[i])
+        for i in range(n):
+            psi[i] = k[i]
+    elif kind == MATERN32:
+        for i in range(n):
+            k[i] = math.sqrt(3.0 * k[i])
+        for i in range(n):
+            psi[i] = variance * exp(-k[i])
+        for i in range(n):
+            k[i] = (1.0 + k[i]) * psi[i]
+            psi[i] *= 3.0
+    else:
+        for i in range(n):
+            k[i] = math.sqrt(5.0 * k[i])
+        for i in range(n):
+            psi[i] = variance * exp(-k[i])
+        for i in range(n):
+            r = k[i]
+            k[i] = (1.0 + r + r * r / 3.0) * psi[i]
+            psi[i] *= (5.0 / 3.0) * (1.0 + r)
+    for i in range(n):
+        k[i] = k[i] if active[i] != 0.0 else 0.0
+        psi[i] = psi[i] if active[i] != 0.0 else 0.0
 
 
-@njit(_F(_I1, _A1, _A2, _A1, _A1, _F, _A1, _A1, _A2, types.boolean), **_INNER)
-def _kernel(flags, z, basis, active, log_lengthscale, log_variance, log_action, k, dk, slopes):
-    """k (and with ``slopes`` dk) between z and the basis; returns k(z, z)."""
-    kind, n_a = flags[KIND], flags[ACTIONS]
-    n_s = z.shape[0] - n_a
+@njit(F(INT, INT, A1, A2, A1, A1, F, A1, A1, A1, A1), **INNER)
+def kernel_row(kind, n_a, z, basis, active, log_lengthscale, log_variance, log_action, k, psi, phi):
+    """k between z and the basis; returns k(z, z).
+
+    ``psi`` and ``phi`` make the derivatives: ``dk/dz = psi L^-2 (basis - z)`` of a state,
+    ``phi Lambda basis`` of an action.
+    """
+    n, n_s = basis.shape[0], z.shape[0] - n_a
     start = 0.0 if n_s > 0 else 1.0  # without a state it is a LinearKernel, which has a constant
-    variance, w, lam = math.exp(log_variance), np.exp(-log_lengthscale), np.exp(log_action)
-    for i in range(basis.shape[0]):
-        if active[i] == 0.0:
-            k[i] = 0.0
-            if slopes:
-                dk[i, :] = 0.0
-            continue
-        d2 = 0.0
+    variance, w = math.exp(log_variance), np.empty(n_s)
+    for j in range(n_s):
+        w[j] = exp(-log_lengthscale[j])
+    for i in range(n):
+        d2, point = 0.0, basis[i]
         for j in range(n_s):
-            u = (basis[i, j] - z[j]) * w[j]
+            u = (point[j] - z[j]) * w[j]
             d2 += u * u
-        phi, psi = _phi_psi(kind, d2)
-        phi, psi, inner = variance * phi, variance * psi, 1.0
-        if n_a > 0:
-            inner = start
-            for j in range(n_a):
-                inner += z[n_s + j] * lam[j] * basis[i, n_s + j]
-        k[i] = phi * inner
-        if slopes:
-            psi *= inner
-            for j in range(n_s):
-                dk[i, j] = psi * (basis[i, j] - z[j]) * w[j] * w[j]
-            for j in range(n_a):
-                dk[i, n_s + j] = phi * lam[j] * basis[i, n_s + j]
+        k[i] = d2
+    _correlations(kind, variance, active, k, psi)
     if n_a == 0:
         return variance
-    norm = start
+    norm, by = start, np.empty(n_a)
     for j in range(n_a):
-        norm += z[n_s + j] * z[n_s + j] * lam[j]
+        by[j] = z[n_s + j] * math.exp(log_action[j])
+        norm += z[n_s + j] * by[j]
+    for i in range(n):
+        inner = start
+        for j in range(n_a):
+            inner += by[j] * basis[i, n_s + j]
+        phi[i] = k[i]
+        k[i] = phi[i] * inner if active[i] != 0.0 else 0.0
+        psi[i] *= inner
     return variance * norm
 
 
-@njit(types.void(_A2, _A1, _A1), **_INNER)
-def _times(matrix, vector, out):
-    """``out = matrix vector``, for a matrix that is symmetric: its rows lie together."""
+@njit(types.void(INT, A1, A2, A1, A1, A1, A1, A2, A2), **INNER)
+def kernel_slopes(n_a, z, basis, psi, phi, log_lengthscale, log_action, left, out):
+    """``out = left' dk/dz``, ``left (slots, rows)``."""
+    n_s, rows, u = z.shape[0] - n_a, out.shape[0], np.empty(z.shape[0])
+    out[:] = 0.0
+    for i in range(basis.shape[0]):
+        if psi[i] == 0.0 and (n_a == 0 or phi[i] == 0.0):
+            continue
+        point, a = basis[i], psi[i]
+        for j in range(n_s):
+            u[j] = a * (point[j] - z[j])
+        for j in range(n_s, n_s + n_a):
+            u[j] = phi[i] * point[j]
+        for r in range(rows):
+            to, b = out[r], left[i, r]
+            for j in range(u.shape[0]):
+                to[j] += b * u[j]
+    for j in range(u.shape[0]):
+        u[j] = exp(-2.0 * log_lengthscale[j]) if j < n_s else math.exp(log_action[j - n_s])
+    for r in range(rows):
+        for j in range(u.shape[0]):
+            out[r, j] *= u[j]
+
+
+@njit(types.void(A2, A1, A1), **INNER)
+def times(A, vector, out):
+    """``out = A vector``."""
     n = vector.shape[0]
     for i in range(n):
-        row, total = matrix[i], 0.0
+        row, total = A[i], 0.0
         for j in range(n):
             total += row[j] * vector[j]
         out[i] = total
 
 
-@njit(_F(_F, _F), **_INNER)
+@njit(F(F, F), **INNER)
 def _remaining(c, q):
     """``c + q``, which rounding must not turn negative."""
-    return max(c + q, 100.0 * _EPS * q)
+    return max(c + q, 100.0 * EPS * q)
 
 
-@njit(types.int64(_F, _A1, _A1, _A1, _A3, _A3), **_INNER)
+@njit(INT(F, A1, A1, A1, A3, A3), **INNER)
 def _least_loss(s2, active, c_diag, q_diag, moments, vectors):
     """The point that loses least when it is pruned, see ``pruning_loss``."""
     best, m, losses = np.inf, vectors.shape[2], np.empty(active.shape[0])
@@ -132,7 +159,7 @@ def _least_loss(s2, active, c_diag, q_diag, moments, vectors):
     return 0
 
 
-@njit(types.void(_A3, _A3, _A1, _A1, _A1, _A1, _F, _F, types.int64, _F), **_INNER)
+@njit(types.void(A3, A3, A1, A1, A1, A1, F, F, INT, F), **INNER)
 def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
     """Add the new point to C and Q and prune point i of all three, in one pass.
 
@@ -175,21 +202,27 @@ def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
 
 
 @njit(
-    types.int64(_A1, _A1, _F, _F, _A1, _A2, _A1, _I1, _I1, _A3, _A3, _A1, _A1, _F, _F, _A1, _A1),
-    **_INNER,
+    INT(A1, F, F, A1, A1, A1, I1, I1, A3, A3, F, A1, F, F, A1, A1),
+    **INNER,
 )
-def _absorb(
-    z, t, prior, s2, k, basis, active, count, slot_, moments, vectors, robust, level, threshold,
-    jitter, figures, error,
+def absorb(
+    t, prior, s2, k, Ck, active, count, slot_, moments, vectors, robust, level, threshold, jitter,
+    figures, error,
 ):  # fmt: skip
-    """One sample of one model, see ``absorb``; returns the event."""
+    """One sample of one model, see ``recursion.absorb``; returns the event. Its input is in the free slot.
+
+    Args:
+        Ck: is overwritten.
+        robust, level: square of a robust weight's threshold (0: none), share of samples distrusted.
+        figures: novelty, nis, weight and latent variance.
+        error: innovation.
+    """
     M, m = k.shape[0], t.shape[0]
     capacity, slot = M - 1, slot_[0]
     C, Q, W = moments[0], moments[1], moments[2]
     prior *= 1.0 + jitter
-    Ck, e = np.empty(M), np.empty(M)
-    _times(C, k, Ck)
-    _times(Q, k, e)
+    e = np.empty(M)
+    times(Q, k, e)
     kCk, ke = 0.0, 0.0
     for i in range(M):
         kCk, ke = kCk + Ck[i] * k[i], ke + e[i] * k[i]
@@ -204,20 +237,18 @@ def _absorb(
         nis += error[o] * error[o]
     nis /= m * (s2 + v)
     noise, weight = s2, 1.0
-    if robust.shape[0] > 0:
-        distrusted = 1.0 if nis > robust[0] else 0.0
+    if robust > 0.0:
+        distrusted = 1.0 if nis > robust else 0.0
         if distrusted:
             trust = (DISTRUSTED_MOST - level[0]) / (DISTRUSTED_MOST - DISTRUSTED)
-            weight = (robust[0] / nis) ** min(max(trust, 0.0), 1.0)
+            weight = (robust / nis) ** min(max(trust, 0.0), 1.0)
         level[0] += RATE * (distrusted - level[0])
         noise = (s2 + v) / weight - v
     full = count[0] == capacity
-    novel = gamma > threshold * prior
+    novel = gamma > max(threshold * prior, LEAST_NOVELTY * s2)
     dropped = 0.0 if novel else gamma
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
-    for j in range(z.shape[0]):
-        basis[slot, j] = z[j]
-    figures[0], figures[1], figures[2], figures[3] = gamma / max(prior, _TINY), nis, weight, v
+    figures[0], figures[1], figures[2], figures[3] = gamma / max(prior, TINY), nis, weight, v
 
     s = Ck
     if novel:
@@ -269,138 +300,3 @@ def _absorb(
     active[i] = 0.0
     slot_[0] = i
     return 3
-
-
-@njit(types.void(_A2, _A2, _A2), **_INNER)
-def _slopes(alpha, dk, out):
-    """``out = alpha' dk``."""
-    out[:] = 0.0
-    for i in range(alpha.shape[0]):
-        for o in range(alpha.shape[1]):
-            row, a = out[o], alpha[i, o]
-            for j in range(dk.shape[1]):
-                row[j] += a * dk[i, j]
-
-
-@njit(
-    types.void(
-        _I1, types.boolean[::1], _A1, _A1, _A2, _A1,
-        _A3, _A2, _I1, _I1, _A4, _A4,
-        *_HYPER, _A2, *_UNITS, _A1, _A1, _F, _F, _I1, _A2, _A1,
-    ),
-    **_COMMON,
-)  # fmt: skip
-def absorb_fleet(
-    flags, on, x, y, given_k, given_prior,
-    basis, active, count, slot, moments, vectors,
-    log_lengthscale, log_variance, log_action, log_noise, shift, scale, shift_y, scale_y, reach,
-    robust, levels, threshold, jitter, event, figures, errors,
-):  # fmt: skip
-    """One sample per model where ``on``.
-
-    Args:
-        flags: kind of kernel, width of the action.
-        x, y, errors: one model's after the other's.
-        given_k, given_prior: k and k** of a kernel that is not known here, in the learner's units.
-        robust, levels: square of a robust weight's threshold, share of samples distrusted; or empty.
-        figures: novelty, nis, weight and latent variance of each model; as they are where not ``on``.
-        errors: innovations.
-    """
-    B, d, m = basis.shape[0], basis.shape[2], log_noise.shape[1]
-    z, t = np.empty(d), np.empty(m)
-    k, none = np.empty(basis.shape[1]), np.empty((0, 0))
-    found = np.empty(4)
-    for b in range(B):
-        if not on[b]:
-            continue
-        own, unit = min(b, log_variance.shape[0] - 1), min(b, shift.shape[0] - 1)
-        for j in range(d):
-            z[j] = min(max((x[b * d + j] - shift[unit, j]) / scale[unit, j], -reach[j]), reach[j])
-        log_s2 = 0.0
-        for o in range(m):
-            t[o] = (y[b * m + o] - shift_y[unit, o]) / scale_y[unit, o]
-            log_s2 += log_noise[b, o]
-        s2 = math.exp(log_s2 / m)
-        if flags[KIND] == GIVEN:
-            prior = given_prior[b]
-            for i in range(k.shape[0]):
-                k[i] = given_k[b, i] * active[b, i]
-        else:
-            prior = _kernel(
-                flags, z, basis[b], active[b], log_lengthscale[own], log_variance[own], log_action[own],
-                k, none, False,
-            )  # fmt: skip
-        event[b] = _absorb(
-            z, t, prior, s2, k, basis[b], active[b], count[b : b + 1], slot[b : b + 1], moments[b],
-            vectors[b], robust, levels[b : b + 1], threshold, jitter, found, errors[b * m : (b + 1) * m],
-        )  # fmt: skip
-        for r in range(4):
-            figures[r, b] = found[r]
-
-
-@njit(
-    types.void(
-        _I1, _A1, _A3, _A2, _A4, _A4, *_HYPER, *_UNITS, _A2, types.boolean, types.boolean, _A1, _A1, _A1, _A1
-    ),
-    **_COMMON,
-)  # fmt: skip
-def query_fleet(
-    flags, x, basis, active, moments, vectors,
-    log_lengthscale, log_variance, log_action, shift, scale, shift_y, scale_y, reach, most,
-    with_variance, with_slopes, mean, variance, jacobian, slope,
-):  # fmt: skip
-    r"""One query per model, in the outputs' own units: see ``SparseOnlineGP.predict_with_jacobians``.
-
-    Args:
-        most: largest \|mean\|, of each model and output.
-    """
-    B, M, d, m = basis.shape[0], basis.shape[1], basis.shape[2], vectors.shape[3]
-    n_a, J = flags[ACTIONS], np.empty((m, d))
-    z, k, Ck, dv = np.empty(d), np.empty(M), np.zeros(M), np.zeros(d)
-    dk = np.empty((M, d)) if with_slopes else np.empty((0, 0))
-    for b in range(B):
-        own, unit = min(b, log_variance.shape[0] - 1), min(b, shift.shape[0] - 1)
-        for j in range(d):
-            z[j] = min(max((x[b * d + j] - shift[unit, j]) / scale[unit, j], -reach[j]), reach[j])
-        prior = _kernel(
-            flags, z, basis[b], active[b], log_lengthscale[own], log_variance[own], log_action[own],
-            k, dk, with_slopes,
-        )  # fmt: skip
-        alpha = vectors[b, 0]
-        value = mean[b * m : (b + 1) * m]
-        value[:] = 0.0
-        for i in range(M):
-            for o in range(m):
-                value[o] += alpha[i, o] * k[i]
-        for o in range(m):
-            value[o] = value[o] * scale_y[unit, o] + shift_y[unit, o]
-        if with_slopes:
-            _slopes(alpha, dk, J)
-            for o in range(m):
-                inside = abs(value[o]) <= most[b, o]
-                for j in range(d):
-                    slope_j = J[o, j] * scale_y[unit, o] / scale[unit, j]
-                    jacobian[(b * m + o) * d + j] = slope_j if inside and abs(z[j]) < reach[j] else 0.0
-        for o in range(m):
-            value[o] = min(max(value[o], -most[b, o]), most[b, o])
-        if not with_variance:
-            continue
-        _times(moments[b, 0], k, Ck)
-        v = prior
-        for i in range(M):
-            v += Ck[i] * k[i]
-        v = max(v, 0.0)
-        for o in range(m):
-            variance[b * m + o] = v * scale_y[unit, o] * scale_y[unit, o]
-        if with_slopes:
-            dv[:] = 0.0
-            for i in range(M):
-                a = 2.0 * Ck[i]
-                for j in range(d):
-                    dv[j] += a * dk[i, j]
-            for j in range(n_a):  # k(x, x) of an action-linear kernel
-                dv[d - n_a + j] += 2.0 * z[d - n_a + j] * math.exp(log_variance[own] + log_action[own, j])
-            for o in range(m):
-                for j in range(d):
-                    by = scale_y[unit, o] * scale_y[unit, o] / scale[unit, j]
-                    slope[(b * m + o) * d + j] = dv[j] * by if abs(z[j]) < reach[j] else 0.0

@@ -1,72 +1,66 @@
-"""A deep kernel's network as compiled loops: inputs to where the kernel is a plain one, and slopes back.
-
-Conventions as in :mod:`~torch_ekm.residual.sparse_gp.engine.numba_kernels`.
-"""
+"""A deep kernel's network as compiled loops for one model, see :class:`~torch_ekm.residual.DeepKernel`."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 from numba import njit, types
 
-from .numba_kernels import _A1, _A2, _A3, _COMMON, _I1, absorb_fleet, query_fleet
-
-__all__ = ["absorb_fleet", "embed_fleet", "query_fleet"]
+from .numba_math import A1, A2, I1, INNER, INT, exp, matrix_at, vector_at
 
 
-@njit(types.void(_I1, _A2, _A2, _A2, _A2, _A1, types.boolean, _A2, _A2, _A3), **_COMMON)
-def embed_fleet(widths, network, log_lengthscale, shift, scale, x, with_slopes, z, embedded, slope):
-    """``[z / L, net(z)]`` of one input per model, and ``(d net/dz)'``, see DeepKernel.
+@njit(types.void(I1, I1, INT, A1), **INNER)
+def network(widths, weights, own, values):
+    """A deep kernel's ``net(z)`` at the end of ``values``, which begins with z and holds each layer.
 
     Args:
         widths: of the layers, the input's first.
-        network: weights and biases of each model, layer by layer.
-        x: one model's after the other's, in its own units.
-        z: in the learner's units ``(models, d)``.
-        embedded, slope: results, ``(models, d + features)`` and, with slopes, ``(models, d, features)``.
+        weights: addresses of weights and biases, layer by layer, of one model after the other's.
+        own: which model's.
     """
-    B, d = z.shape
-    widest, layers = 0, widths.shape[0] - 1
-    for layer in range(widths.shape[0]):
-        widest = max(widest, widths[layer])
-    values, rows = np.zeros((2, widest)), d if with_slopes else 0
-    slopes = np.zeros((2, rows, widest))
-    for b in range(B):
-        own, unit = min(b, network.shape[0] - 1), min(b, shift.shape[0] - 1)
-        weights = network[own]
-        for j in range(d):
-            z[b, j] = (x[b * d + j] - shift[unit, j]) / scale[unit, j]
-            embedded[b, j] = z[b, j] * math.exp(-log_lengthscale[own, j])
-            values[0, j] = z[b, j]
-        at, now = 0, 0
-        for layer in range(layers):
-            n_in, n_out, last = widths[layer], widths[layer + 1], layer == layers - 1
-            old, new = values[now], values[1 - now]
-            bias = at + n_in * n_out
+    at, layers = 0, widths.shape[0] - 1
+    for layer in range(layers):
+        n_in, n_out, last = widths[layer], widths[layer + 1], layer == layers - 1
+        W = matrix_at(weights[2 * layer], own, n_in, n_out)
+        new, old = values[at + n_in : at + n_in + n_out], values[at : at + n_in]
+        for j in range(n_out):
+            new[j] = 0.0
+        if not last:
+            bias = vector_at(weights[2 * layer + 1], own, n_out)
             for j in range(n_out):
-                new[j] = 0.0 if last else weights[bias + j]
-            for i in range(n_in):
-                a, row = old[i], weights[at + i * n_out : at + (i + 1) * n_out]
-                for j in range(n_out):
-                    new[j] += a * row[j]
-            if not last:
-                for j in range(n_out):
-                    new[j] = math.tanh(new[j])
-            for c in range(rows):
-                before, after = slopes[now, c], slopes[1 - now, c]
-                for j in range(n_out):
-                    after[j] = weights[at + c * n_out + j] if layer == 0 else 0.0
-                if layer > 0:
-                    for i in range(n_in):
-                        a, row = before[i], weights[at + i * n_out : at + (i + 1) * n_out]
-                        for j in range(n_out):
-                            after[j] += a * row[j]
-                if not last:
-                    for j in range(n_out):
-                        after[j] *= 1.0 - new[j] * new[j]
-            now, at = 1 - now, bias + (0 if last else n_out)
+                new[j] = bias[j]
+        for i in range(n_in):
+            a, by = old[i], W[i]
+            for j in range(n_out):
+                new[j] += a * by[j]
+        if not last:
+            for j in range(n_out):
+                new[j] = 1.0 - 2.0 / (exp(2.0 * new[j]) + 1.0)  # tanh
+        at += n_in
+
+
+@njit(types.void(I1, I1, INT, A1, A2, A2), **INNER)
+def network_slopes(widths, weights, own, values, by, out):
+    """``out += by dnet/dz``, from the features back: ``by (rows, features)``."""
+    layers, widest = widths.shape[0] - 1, 0
+    for layer in range(layers + 1):
+        widest = max(widest, widths[layer])
+    at, both = values.shape[0] - widths[layers], np.empty((2, widest))
+    for r in range(by.shape[0]):
+        now, begin = 0, at
         for j in range(widths[layers]):
-            embedded[b, d + j] = values[now, j]
-            for c in range(rows):
-                slope[b, c, j] = slopes[now, c, j]
+            both[0, j] = by[r, j]
+        for layer in range(layers - 1, -1, -1):
+            n_in, n_out = widths[layer], widths[layer + 1]
+            W, old, new = matrix_at(weights[2 * layer], own, n_in, n_out), both[now], both[1 - now]
+            begin -= n_in
+            for i in range(n_in):
+                total, line = 0.0, W[i]
+                for j in range(n_out):
+                    total += line[j] * old[j]
+                new[i] = total
+            if layer > 0:
+                for i in range(n_in):
+                    new[i] *= 1.0 - values[begin + i] * values[begin + i]
+            now = 1 - now
+        for j in range(widths[0]):
+            out[r, j] += both[now, j]

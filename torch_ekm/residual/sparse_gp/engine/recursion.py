@@ -16,6 +16,8 @@ from ..posterior import SparsePosterior
 #: what losses may differ by and count as the same, relative and per output in nats: a basis that has learned
 #: nothing yet must not depend on how a processor rounds
 TIE, TIE_KL = 1e-9, 1e-14
+#: novelty below this share of the noise says nothing; its inverse in Q would grow without end
+LEAST_NOVELTY = 1e-12
 
 
 class Absorbed(NamedTuple):
@@ -72,7 +74,7 @@ def absorb(
         weight = weight * part.weigh(nis, mask)
     noise = (s2 + v) / weight - v if weighing else s2
     full = posterior.count == posterior.capacity
-    novel = gamma > posterior.novelty_threshold * prior
+    novel = gamma > torch.maximum(posterior.novelty_threshold * prior, LEAST_NOVELTY * s2)
     dropped = gamma * ~novel  # novelty that a projection ignores
     gain, precision = 1.0 / (noise + v - dropped), s2 / noise
     if mask is not None:

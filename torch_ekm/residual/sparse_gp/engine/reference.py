@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from ....typing import Float, Tensor
-from ...report import MomentsWithJacobians
+from ...report import MomentsWithJacobians, UpdateReport
 from ..part import Host
 from .recursion import Absorbed, absorb
 
@@ -67,9 +69,9 @@ class ReferenceEngine:
         # where z is cut g is flat, but what is known of it does not grow
         return _out_slope(gp, v.clamp_min(0.0).sqrt().unsqueeze(-2), 1, torch.zeros_like(z))
 
-    def accepts(self, gp: Host, x: Tensor, y: Tensor) -> bool:
-        """Whether this is one good sample for each model, so that :meth:`absorb` may take it unchecked."""
-        return False
+    def learn(self, gp: Any, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        """All that an update does; None: not one good sample for each model, or torch must do it."""
+        return None
 
     def absorb(self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
         """One checked sample per model where ``on`` is 1, see :func:`~.recursion.absorb`."""

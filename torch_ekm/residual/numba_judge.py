@@ -1,0 +1,189 @@
+"""How a mixture judges its experts as compiled loops, one output of one model at a time.
+
+Equations and names are those of :class:`~torch_ekm.residual.MixtureResidual` and
+:class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a row of
+:mod:`~torch_ekm.residual.mixture_plan`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, types
+
+from . import experts as E
+from . import mixture_plan as G
+from .base import FARTHEST as FARTHEST_MEAN
+from .sparse_gp import plan as P
+from .sparse_gp.engine.numba_math import A1, I1, INNER, INT, TINY, F, exp, log, matrix_at, vector_at
+from .tails import LARGEST, MEMORY
+
+
+@njit(F(F), **INNER)
+def _bounded(z):
+    return min(max(z, -E.FARTHEST), E.FARTHEST) if z == z else E.FARTHEST
+
+
+@njit(F(A1, A1), **INNER)
+def _typical(log_scale, evidence):
+    """See ``ScaleMixture.typical``."""
+    most, total, mean = -np.inf, 0.0, 0.0
+    for t in range(evidence.shape[0]):
+        most = max(most, evidence[t])
+    for t in range(evidence.shape[0]):
+        p = math.exp(evidence[t] - most)
+        total += p
+        mean += p * log_scale[t]
+    return math.exp(mean / total)
+
+
+@njit(types.void(I1, INT, F, F), **INNER)
+def _follow_tails(g, o, z, since):
+    """See ``ScaleMixture.observe``."""
+    n = g[G.N_TAILS]
+    log_scale, evidence = vector_at(g[G.TAIL_SCALE], o, n), vector_at(g[G.TAIL_EVIDENCE], o, n)
+    rates, freedoms, at_zero = (
+        vector_at(g[G.RATES], 0, n), vector_at(g[G.FREEDOMS], 0, n), vector_at(g[G.AT_ZERO], 0, n)
+    )  # fmt: skip
+    most, fastest = -np.inf, 0.5 / (1.0 + since / 4.0)
+    for t in range(n):
+        nu = freedoms[t]
+        r = (z / math.exp(log_scale[t])) ** 2
+        density = at_zero[t] - log_scale[t] - 0.5 * (nu + 1.0) * math.log1p(r / nu)
+        evidence[t] = MEMORY * evidence[t] + density
+        most = max(most, evidence[t])
+        moved = log_scale[t] + max(rates[t], fastest) * ((nu + 1.0) * r / (nu + r) - 1.0)
+        log_scale[t] = min(max(moved, -LARGEST), LARGEST)
+    for t in range(n):
+        evidence[t] -= most
+
+
+@njit(types.void(I1, INT, F, A1, A1), **INNER)
+def _weigh(g, o, scale, far, p):
+    """Evidence and what is carried over, from innovations ``far`` in typical scales; ``p``: ``r / 10``.
+
+    ``p`` becomes the experts' weights, 1 at the largest.
+    """
+    n, most = g[G.N_EXPERTS], -np.inf
+    experts, prior = matrix_at(g[G.EXPERTS], 0, 5, n), vector_at(g[G.PRIOR], 0, n)
+    rho, beta, cap = experts[2], experts[3], experts[4]
+    evidence, w = vector_at(g[G.EVIDENCE], o, n), vector_at(g[G.INNOVATION], o, n)
+    level, trend = vector_at(g[G.LEVEL], o, n), vector_at(g[G.TREND], o, n)
+    for e in range(n):
+        p[e] = log(1.0 + p[e])
+    for e in range(n):
+        evidence[e] = MEMORY * evidence[e] - 0.5 * (E.FREEDOM + 1.0) * p[e]
+    for e in range(n):
+        most = max(most, evidence[e])
+    for e in range(n):
+        evidence[e] = max(evidence[e] - most, E.LEAST)
+    for e in range(n):
+        a = far[e] / cap[e]
+        w[e] = scale * far[e] / (1.0 + a * a)
+    for e in range(n):
+        trend[e] = E.TREND_DECAY * trend[e] + beta[e] * w[e]
+    for e in range(n):
+        level[e] = E.LEVEL_DECAY * level[e] + rho[e] * w[e]
+    for e in range(n):
+        level[e] += trend[e]
+        if not abs(level[e]) <= E.FARTHEST * scale:
+            level[e] = trend[e] = 0.0
+    most = -np.inf
+    for e in range(n):
+        p[e] = prior[e] + evidence[e]
+    for e in range(n):
+        most = max(most, p[e])
+    for e in range(n):
+        p[e] = exp(p[e] - most)
+
+
+@njit(types.void(I1, INT, INT, A1), **INNER)
+def _settle(g, o, n_learners, p):
+    """What queries need of the experts, from weights p that do not sum to 1 yet, see ``_settle``."""
+    n, n_shares, total = g[G.N_EXPERTS], g[G.N_SHARES], 0.0
+    n_groups = n_learners * n_shares
+    each, experts = n // n_groups, matrix_at(g[G.EXPERTS], 0, 5, n)
+    h, kappa = experts[0], experts[1]
+    w, level = vector_at(g[G.INNOVATION], o, n), vector_at(g[G.LEVEL], o, n)
+    gain, offset = vector_at(g[G.GAIN], o, n_learners), vector_at(g[G.OFFSET], o, 1)
+    mass, spread = vector_at(g[G.MASS], o, n_groups), vector_at(g[G.SPREAD], o, n_groups)
+    shift = vector_at(g[G.SHIFT], o, n_groups)
+    for e in range(n):
+        total += p[e]
+    gain[:] = 0.0
+    offset[0] = 0.0
+    for k in range(n_groups):
+        held, carried, apart = 0.0, 0.0, 0.0
+        for e in range(k * each, (k + 1) * each):
+            held += p[e]
+        for e in range(k * each, (k + 1) * each):
+            carried += p[e] * (level[e] - kappa[e] * w[e])
+        middle = carried / max(held, TINY)
+        for e in range(k * each, (k + 1) * each):
+            apart += p[e] * (level[e] - kappa[e] * w[e] - middle) ** 2
+        mass[k], shift[k], spread[k] = held / total, middle, apart / total
+        gain[k // n_shares] += held / total * h[k * each]
+        offset[0] += carried / total
+
+
+@njit(F(I1, INT, A1), **INNER)
+def mean_of(g, o, means):
+    """The mixture's, cut at twice the largest y."""
+    mean, gain = vector_at(g[G.OFFSET], o, 1)[0], vector_at(g[G.GAIN], o, means.shape[0])
+    for i in range(means.shape[0]):
+        mean += gain[i] * means[i]
+    return mean
+
+
+@njit(F(I1, INT, A1), **INNER)
+def scatter_of(g, o, noisy):
+    """Variance of y as the learners state it, by their weights."""
+    n_learners, n_shares, variance = noisy.shape[0], g[G.N_SHARES], 0.0
+    mass = vector_at(g[G.MASS], o, n_learners * n_shares)
+    for k in range(mass.shape[0]):
+        variance += mass[k] * noisy[k // n_shares]
+    return variance
+
+
+@njit(types.void(I1, INT, A1, A1), **INNER)
+def make_finite(g, o, means, variances):
+    """See ``_finite`` and ``_wide`` of the mixture."""
+    most = vector_at(g[P.LARGEST], o, 1)[0]
+    for i in range(means.shape[0]):
+        means[i] = means[i] if math.isfinite(means[i]) else 0.0
+        variances[i] = variances[i] if math.isfinite(variances[i]) else most * most
+
+
+@njit(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1), **INNER)
+def judge(g, o, y, judged, since, means, noisy, far, p):
+    """One output of one model: how far y lies from each expert's mean, and what follows; returns the nis."""
+    n, n_learners = g[G.N_EXPERTS], means.shape[0]
+    each, inflation = n // n_learners, vector_at(g[G.INFLATION], o, 1)
+    experts, most = matrix_at(g[G.EXPERTS], 0, 5, n), FARTHEST_MEAN * vector_at(g[P.LARGEST], o, 1)[0]
+    h, kappa = experts[0], experts[1]
+    mean, deviation = min(max(mean_of(g, o, means), -most), most), math.sqrt(scatter_of(g, o, noisy))
+    z = _bounded((y - mean) / deviation)
+    if judged:
+        tails = g[G.N_TAILS]
+        typical = _typical(vector_at(g[G.TAIL_SCALE], o, tails), vector_at(g[G.TAIL_EVIDENCE], o, tails))
+        scale = deviation * typical
+        width = min(max(E.RMS_LEAST * math.sqrt(inflation[0]) / typical, 1.0), E.RMS_MOST)
+        w, level = vector_at(g[G.INNOVATION], o, n), vector_at(g[G.LEVEL], o, n)
+        for i in range(n_learners):
+            for e in range(i * each, (i + 1) * each):
+                far[e] = h[e] * means[i] - kappa[e] * w[e]
+        for e in range(n):
+            far[e] = (y - (far[e] + level[e])) / scale
+        by = 1.0 / (E.FREEDOM * width * width)
+        for e in range(n):
+            far[e] = _bounded(far[e])
+        for e in range(n):
+            p[e] = far[e] * far[e] * by
+        _weigh(g, o, scale, far, p)
+        _settle(g, o, n_learners, p)
+        square = min(z * z, E.SQUARE_MOST * inflation[0])
+        rate = max(1.0 / (since + 2.0), E.RATE)
+        inflation[0] = max(inflation[0] + rate * (square - inflation[0]), 1e-12)
+        _follow_tails(g, o, z, since)
+    return z * z / inflation[0]

@@ -1,0 +1,200 @@
+"""A learner's buffers as compiled loops see them, and which learners these know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from itertools import chain
+from operator import is_
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from ....typing import Tensor
+from ...kernels.action_linear import ActionLinearKernel
+from ...kernels.deep import DeepKernel
+from ...kernels.kernel import Kernel
+from ...kernels.linear import LinearKernel
+from ...kernels.stationary import Matern32, Matern52, SquaredExponential
+from .. import plan as P
+from ..forgetting import ForgettingFactor, ProcessNoise
+from ..hyperparameters import LearnHyperparameters
+from ..monitor import RING_SIZE, CalibrateNoise, DetectChanges, RobustWeight
+from ..part import Host, Part
+from ..replay import ReplayMemory
+from ..units import Standardize
+
+_PARTS = (
+    Standardize, RobustWeight, DetectChanges, CalibrateNoise, LearnHyperparameters, ForgettingFactor,
+    ProcessNoise,
+)  # fmt: skip
+_KINDS = {SquaredExponential: 0, Matern32: 1, Matern52: 2}  # as numba_kernels has them
+
+
+class Bound:
+    """A module's memory as compiled loops see it, and whether it is still the module's."""
+
+    usable = False
+    all: np.ndarray  #: True for each model
+
+    def __init__(self) -> None:
+        self.row = np.zeros(P.FIELDS, np.int64)
+        self.kept: list[Any] = []  # arrays of their own, which live as long as their addresses are used
+        self._owners: list[dict[str, Any]] = []
+        self._values: list[Any] = []
+        self._moved: list[Tensor] = []
+
+    def watch(
+        self, modules: Iterable[nn.Module], *owners: dict[str, Any], moved: Iterable[Tensor] = ()
+    ) -> None:
+        """What these hold must stay the same objects, and ``moved`` at their addresses."""
+        own = [dicts for one in modules for dicts in (one._parameters, one._buffers)]
+        self._owners = [one for one in (*own, *owners) if one]
+        self._values = list(chain.from_iterable(map(dict.values, self._owners)))
+        self._moved = list(moved)  # by an assignment to .data
+        self._addresses = [t.data_ptr() for t in self._moved]
+
+    def is_current(self) -> bool:
+        """Whether all are those that were bound."""
+        held = chain.from_iterable(map(dict.values, self._owners))
+        return (
+            all(map(is_, held, self._values)) and list(map(Tensor.data_ptr, self._moved)) == self._addresses
+        )
+
+    def own(self, array: np.ndarray) -> int:
+        """The address of an array that lives as long as this."""
+        self.kept.append(array)
+        return array.ctypes.data
+
+
+class Plan(Bound):
+    """What compiled loops know of a sparse GP, or why they cannot do its work.
+
+    The arrays are made at the first call, and again whenever a buffer is another one: the learner was moved,
+    or loaded with other tensors.
+    """
+
+    def __init__(self, gp: Host) -> None:
+        super().__init__()
+        self.kernel = gp.kernel
+        self.units, self.changes = gp.part(Standardize), gp.part(DetectChanges)
+        self.learning = gp.part(LearnHyperparameters)
+        self.past: ReplayMemory | None = None if self.learning is None else self.learning.past
+        self.others = tuple(p for p in gp.parts if type(p) in (CalibrateNoise, LearnHyperparameters))
+        self.shape = tuple(gp.batch_shape)
+        self.one, self.two = (*self.shape, gp.out_features), (*self.shape, gp.out_features, gp.in_features)
+        self.ring = RING_SIZE if self.changes else 1
+        self.all = np.ones(math.prod(self.shape), np.bool_)
+        fields = self._fields(gp)
+        tensors = [value for value in fields.values() if isinstance(value, Tensor)]
+        self.parameters = tuple(gp.kernel.hyperparameters().values())
+        self.watch(gp.modules(), gp._modules, moved=(*self.parameters, gp.log_noise_variance))
+        self.reason = _reason(gp, [*tensors, *self.parameters])
+        self.usable = not self.reason
+        if not self.usable:
+            return
+        for field, value in fields.items():
+            self.row[field] = value.data_ptr() if isinstance(value, Tensor) else value
+        self._embedded: Tensor | None = None
+        if isinstance(gp.kernel, DeepKernel):
+            self._bind_network(gp.kernel, gp.posterior.basis)
+
+    def _fields(self, gp: Host) -> dict[int, Any]:
+        d, m, n = gp.in_features, gp.out_features, math.prod(self.shape)
+        posterior, units, kernel = gp.posterior, gp.units, _known(gp.kernel)
+        fields: dict[int, Any] = {
+            P.MODELS: n, P.SLOTS: posterior.capacity + 1, P.IN: d, P.OUT: m, P.WIDTH: d,
+            P.OWN_UNITS: int(bool(units.affine())),
+            P.BASIS: posterior.basis, P.ACTIVE: posterior.active, P.COUNT: posterior.count,
+            P.SLOT: posterior.slot, P.MOMENTS: posterior.moments, P.VECTORS: posterior.vectors,
+            P.PENDING: gp.pending, P.LARGEST: gp.largest, P.LOG_NOISE: gp.log_noise_variance,
+        }  # fmt: skip
+        if kernel is not None:
+            fields |= kernel
+        if units.affine():
+            fields |= dict(zip((P.SHIFT, P.SCALE, P.SHIFT_Y, P.SCALE_Y), units.affine(), strict=True))
+            fields[P.REACH] = units.reach
+        else:
+            plain = {P.SHIFT: (d, 0.0), P.SCALE: (d, 1.0), P.SHIFT_Y: (m, 0.0), P.SCALE_Y: (m, 1.0)}
+            for field, (size, value) in {**plain, P.REACH: (d, np.inf)}.items():
+                fields[field] = self.own(np.full(size, value))
+        robust = gp.part(RobustWeight)
+        threshold = 0.0 if robust is None else robust.threshold**2
+        fields[P.FIGURES] = self.own(np.array([posterior.novelty_threshold, posterior.jitter, threshold]))
+        if robust is not None:
+            fields[P.DISTRUSTED] = robust.level
+        for part in (self.units, gp.part(CalibrateNoise), self.changes, self.learning):
+            if part is not None:
+                fields |= part.compiled()
+        return fields
+
+    def _bind_network(self, kernel: DeepKernel, basis: Tensor) -> None:
+        """Room for the basis as the network makes it, and where its weights are."""
+        *hidden, last = kernel.weights
+        layers = [p for pair in zip(hidden, kernel.biases, strict=True) for p in pair] + [last, last]
+        widths = [basis.shape[-1], *(weight.shape[-1] for weight in kernel.weights)]
+        self._embedded = basis.new_empty(*basis.shape[:-1], widths[0] + widths[-1])
+        row, addresses = self.row, [p.data_ptr() for p in layers]
+        row[P.LAYERS], row[P.WIDTH] = len(widths) - 1, widths[0] + widths[-1]
+        row[P.WIDTHS], row[P.WEIGHTS] = self.own(np.array(widths)), self.own(np.array(addresses))
+        row[P.EMBEDDED], self._basis = self._embedded.data_ptr(), basis
+        self._marks: list[int] = []
+
+    def follow(self) -> None:
+        """Embed the basis again where torch changed it, or the network: loops leave no mark on a tensor."""
+        if self._embedded is None:
+            return
+        marks = [t._version for t in (self._basis, *self.parameters)]
+        if marks != self._marks:
+            with torch.no_grad():
+                self._embedded.copy_(self.kernel.embed(self._basis))  # type: ignore[operator]
+            self._marks = marks
+
+
+def _reason(gp: Host, tensors: list[Tensor]) -> str:
+    """Why compiled loops do not know this learner; empty: they do."""
+    if _known(gp.kernel) is None:
+        return f"they do not know its kernel, {type(gp.kernel).__name__}"
+    hooks = [getattr(Part, name) for name in ("before_update", "weigh", "after_update", "noise")]
+    for part in gp.parts:
+        own = [getattr(type(part), hook.__name__) for hook in hooks]
+        if type(part) not in _PARTS and own != hooks:
+            return f"they do not know its part, {type(part).__name__}"
+    if gp.dtype != torch.float64:
+        return f"they compute in float64, and its dtype is {gp.dtype}"
+    if not all(t.is_cpu and t.is_contiguous() for t in tensors):
+        return "a buffer of it is not contiguous, or not on the CPU"
+    if len(_fleet_axes(gp.kernel)) > 1:
+        return "a part of its kernel is one for all models, and a part is not"
+    # these have no version
+    return "it was made in inference mode" if any(t.is_inference() for t in tensors) else ""
+
+
+def _fleet_axes(kernel: Kernel) -> set[int]:
+    """Numbers of axes that its parameters have in front of their own."""
+    own = {"log_variance": 0, "weights": 2}
+    names = ((name.split("."), p) for name, p in kernel.hyperparameters().items())
+    return {p.dim() - own.get(name[-1] if "log" in name[-1] else name[0], 1) for name, p in names}
+
+
+def _known(kernel: Kernel) -> dict[int, Any] | None:
+    """Fields of a kernel that the loops know; None: they do not. A subclass may compute something else."""
+    if type(kernel) is LinearKernel:  # action-linear without a state
+        slopes = kernel.log_slope_variance
+        return {
+            P.KIND: 0, P.ACTIONS: slopes.shape[-1], P.OWN: int(kernel.log_variance.dim() > 0),
+            P.LOG_ACTION: slopes, P.LOG_VARIANCE: kernel.log_variance,
+        }  # fmt: skip
+    inner = {ActionLinearKernel: "state_kernel", DeepKernel: "base"}.get(type(kernel))
+    state: Any = kernel if inner is None else getattr(kernel, inner)
+    if type(state) not in _KINDS:
+        return None
+    fields = {
+        P.KIND: _KINDS[type(state)], P.OWN: int(state.log_variance.dim() > 0),
+        P.LOG_LENGTHSCALE: state.log_lengthscale, P.LOG_VARIANCE: state.log_variance,
+    }  # fmt: skip
+    if isinstance(kernel, ActionLinearKernel):
+        fields |= {P.ACTIONS: kernel.action_features, P.LOG_ACTION: kernel.log_action_variance}
+    return fields
