@@ -10,7 +10,7 @@ import torch
 from obedient_plant import Obedient
 
 from torch_ekm.control import Bands, ClosedLoop, HandFigures, HandKnowledge, LookAndMoveController, PoseTarget
-from torch_ekm.control.model_error import NOISE, ModelError
+from torch_ekm.control.model_error import STEADY, ModelError
 from torch_ekm.enhanced import EnhancedModel
 
 DEG = math.pi / 180
@@ -52,7 +52,7 @@ def test_deviations_of_figures_and_of_g_add_up_along_a_path(path) -> None:
         way = way + one.piece.increment[-3:].numpy()
         band = bands.add(one.piece, one.state)
         axis, size = way / np.linalg.norm(way), np.linalg.norm(way)
-        rest = np.concatenate([np.full(3, 0.03**2), np.ones(3)]) * ((error.across * size) ** 2 + NOISE**2)
+        rest = np.concatenate([np.full(3, 0.03**2), np.ones(3)]) * ((error.across * size) ** 2 + STEADY**2)
         rest[3:] += (error.along**2 - error.across**2) * (size * axis) ** 2
         expected = np.diag(G @ P @ G.T) + g**2 + rest
         np.testing.assert_allclose(band.twist_std.numpy() ** 2, expected, rtol=1e-5)
@@ -84,7 +84,7 @@ def test_errors_along_the_way_and_across_it_are_learned_apart() -> None:
     error, way = ModelError(), torch.tensor([10 * DEG, 0.0, 0.0], dtype=F64)
     for _ in range(40):
         error.see(torch.tensor([-3 * DEG, 0.0, 0.0], dtype=F64), way)
-    noise = NOISE / (10 * DEG)
+    noise = STEADY / (10 * DEG)
     assert error.along == pytest.approx(math.sqrt(0.3**2 - noise**2), rel=1e-3)
     assert error.across < 1e-2
     for _ in range(40):
