@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import torch
 from torch import nn
@@ -39,7 +40,7 @@ class ScaleMixtureLaw(MixtureSameFamily):
 
     def icdf(self, value: Tensor | float) -> Float[Tensor, "*any"]:
         """The value that y exceeds with probability ``1 - value``, by bisection to rounding."""
-        t = self.component_distribution
+        t: Any = self.component_distribution
         p = torch.as_tensor(value, dtype=t.loc.dtype, device=t.loc.device)
         # no t law of two or more degrees of freedom lies farther out than that of two
         far = (2.0 * p - 1.0).abs() / (2.0 * p * (1.0 - p)).sqrt()
