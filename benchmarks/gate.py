@@ -39,6 +39,7 @@ from torch_ekm.control import (
     HandKnowledge,
     Journal,
     LookAndMoveController,
+    OneStep,
     PoseTarget,
     Safety,
 )
@@ -245,9 +246,9 @@ def session(held, seed: int, readings: int, learns: bool, count: Count, refused:
             return slid
 
         plant.command = slips()
-        loop = WatchedLoop(
-            plant, LookAndMoveController(enhanced, axis), knowledge=knowledge, safety=Safety(guards=guards)
-        )
+        known = {"knowledge": knowledge, "safety": Safety(guards=guards)}
+        planner = OneStep() if seed % 4 else None  # an E-KM plans in every other session
+        loop = WatchedLoop(plant, LookAndMoveController(enhanced, axis), **known, planner=planner)
         loop.refused = refused
         angle = float(draw.choice([-15.0, 12.0, 25.0]))
         try:
