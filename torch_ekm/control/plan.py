@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _DEG = math.pi / 180
 _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
+_HOLDS = 0.05  # of its friction that each finger has to spare, for a step of which the model is not sure
 _GRIP = 3  # pieces of a movement that grips: pads that read wrong are seen after it
 _CLOSE = 0.3 * _DEG  # [rad] from which one is enough
 
@@ -147,6 +148,8 @@ class WholeTurn:
 
     piece: float = 2.5 * _DEG
     """Largest step of the rehearsal [rad]."""
+    farthest: float = 30 * _DEG
+    """Of one movement [rad]: what the model does not know at all is seen after it."""
     deviations: float = 2.0
     off_rotation: float = 8 * _DEG
     """Off the focus [rad]; where it is farther off already it may come back."""
@@ -188,6 +191,8 @@ class WholeTurn:
             nearest = min(nearest, (focus.error(target, state), len(waypoints)))
             since = len(waypoints) - nearest[1]
             if (against and not whole) or since >= _AHEAD or (since and nearest[0] < _CLOSE):
+                break
+            if not whole and focus.error(target, seen.state) - focus.error(target, state) > self.farthest:
                 break
         end = End() if nearest[0] < _CLOSE else rehearsal.end
         del waypoints[nearest[1] :]
@@ -248,8 +253,10 @@ class WholeTurn:
         decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
         if decision.status is not StopReason.RUNNING:
             return decision
+        lin = decision.pieces[0].linearization
+        holds = not lin.forces.solved or float(lin.forces.relative_margin.min()) > _HOLDS
         after = controller.focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
-        if after > self.off_rotation:
+        if after > self.off_rotation or not holds:
             return controller.none(StopReason.GIVEN_UP, against, decision.desired)
         return decision
 
