@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 _DEG = math.pi / 180
 _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
 _HOLDS = 0.05  # of its friction that each finger has to spare, for a step of which the model is not sure
+_BACK = 1.5  # times off_rotation from which an object that is farther off is not turned back: it slips out
 _GRIP = 3  # pieces of a movement that grips: pads that read wrong are seen after it
 _CLOSE = 0.3 * _DEG  # [rad] from which one is enough
 
@@ -152,7 +153,7 @@ class WholeTurn:
     """Of one movement [rad]: what the model does not know at all is seen after it."""
     deviations: float = 2.0
     off_rotation: float = 8 * _DEG
-    """Off the focus [rad]; where it is farther off already it may come back."""
+    """Off the focus [rad]; an object that is up to 1.5 times as far off may come back."""
     force: float = 0.6
     """Of a finger that touches [N]."""
     margin: float = 2 * _DEG
@@ -179,7 +180,8 @@ class WholeTurn:
             decision = self._grip(controller, seen, knowledge, firm)
             if decision is not None:
                 return Plan(target, focus, seen.state, decision)
-        most = max(self.off_rotation, focus.off_rotation(target.error(seen.state)))
+        off = focus.off_rotation(target.error(seen.state))
+        most = max(self.off_rotation, min(off, _BACK * self.off_rotation))
         rehearsal = Rehearsal(controller, seen, target, self.piece, longest)
         bands = Bands(controller, knowledge, seen, target)
         waypoints: list[Waypoint] = []
