@@ -33,7 +33,6 @@ from .safety.on_the_way import OnTheWay
 from .safety.safety import Objection
 from .safety.watch import Watch
 
-_DEG = math.pi / 180
 _GRIPS = 2  # movements that only grip, before the first turn
 _FULL, _LEAST = 0.75, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
 

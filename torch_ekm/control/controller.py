@@ -334,8 +334,7 @@ class LookAndMoveController:
         """The best increment, what the model predicts of it, and the last program with its solution."""
         enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
         linear = enhanced is None or enhanced.affine
-        while_far = range(1 if linear else _ITERATIONS)
-        for _ in while_far:
+        for _ in range(1 if linear else _ITERATIONS):
             model = LinearizedModel.about(da, lin, enhanced)
             problem = build_qp(len(da), [part.rows(model, seen) for part in (*self.tasks, *self.limits)])
             solution = problem.solve()

@@ -161,7 +161,7 @@ class HandKnowledge(Recorded, nn.Module):
 
 
 def _of_now(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Files of version 0.3 have a pace in place of the error of the model."""
+    """Older files have a pace in place of the error of the model."""
     kept = {name: value for name, value in state.items() if name != "pace"}
     return kept if len(kept) == len(state) else {**kept, "error.square": ModelError().square}
 

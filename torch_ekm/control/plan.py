@@ -185,16 +185,18 @@ class WholeTurn:
         rehearsal = Rehearsal(controller, seen, target, self.piece, longest)
         bands = Bands(controller, knowledge, seen, target)
         waypoints: list[Waypoint] = []
-        safe, against, nearest = 0, "", (focus.error(target, seen.state), 0)
+        asked = focus.error(target, seen.state)
+        safe, against, nearest = 0, "", (asked, 0)
         for piece, state in rehearsal.pieces():
             waypoints.append(Waypoint(piece, state, bands.add(piece, state)))
             against = against or self._against(waypoints[-1].band, most, first=len(waypoints) == 1)
             safe += not against
-            nearest = min(nearest, (focus.error(target, state), len(waypoints)))
+            left = focus.error(target, state)
+            nearest = min(nearest, (left, len(waypoints)))
             since = len(waypoints) - nearest[1]
-            if (against and not whole) or since >= _AHEAD or (since and nearest[0] < _CLOSE):
+            if since >= _AHEAD or (since and nearest[0] < _CLOSE):
                 break
-            if not whole and focus.error(target, seen.state) - focus.error(target, state) > self.farthest:
+            if not whole and (against or asked - left > self.farthest):
                 break
         end = End() if nearest[0] < _CLOSE else rehearsal.end
         del waypoints[nearest[1] :]

@@ -140,16 +140,14 @@ class Rehearsal:
             return End(PathEnd.CONTACT, (), str(failure))
         if isinstance(failure, UnstableGraspError):
             return End(PathEnd.STABILITY, (), str(failure))
-        lin = hand.linearization
-        links = _bearing(hand) if lin is not None else []
-        sliding = _sliding(hand) if lin is not None else []
+        sliding = _sliding(hand)
         limits = [name for name in hand.at_limits() if name not in self._idle]
         said = str(failure or "") or (self.last.message if self.last else "")
         if failure is None and self._too_long:
             return End(PathEnd.WAY, (), "an actuator goes as far as one movement goes")
         for kind, found, verb in (
             (PathEnd.FRICTION, sliding if failure is not None else [], "is at its friction limit"),
-            (PathEnd.LINK, links, "has no pad, and bears on the object"),
+            (PathEnd.LINK, _bearing(hand), "has no pad, and bears on the object"),
             (PathEnd.ACTUATOR, limits, "stands at the end of its range"),
             (PathEnd.JOINT_STOP, hand.at_stops(_STOP_BEARS), "stands at its stop"),
             (PathEnd.FRICTION, sliding, "slides"),

@@ -93,8 +93,7 @@ class ForceSensitivity(Recorded, nn.Module):
             moved: w [rad].
             said: S w, the change by the model alone [N].
         """
-        along = np.tile(_PRIOR_STD * moved.numpy(), (len(self.theta), 1))
-        u = np.concatenate([said.numpy()[:, None], along], axis=-1)
+        u = _regressors(said.numpy(), moved.numpy())
         variance = self.variance.numpy()
         known = _covariance(
             self.evidence.numpy() + _USUAL * variance[:, None, None] * np.eye(u.shape[-1]), variance
@@ -136,7 +135,7 @@ class ForceSensitivity(Recorded, nn.Module):
         buffers = self.theta, self.evidence, self.variance, self.drift
         theta, D, variance, drift = (buffer.numpy() for buffer in buffers)  # their own memory
         said = S @ w
-        u = np.concatenate([said[:, None], np.tile(_PRIOR_STD * w, (n_pads, 1))], axis=-1)
+        u = _regressors(said, w)
         r = df - said - (u * theta).sum(-1)
         known = ~np.isnan(r)
         if not known.any() or not w.any():
@@ -175,6 +174,11 @@ class ForceSensitivity(Recorded, nn.Module):
 
     def extra_repr(self) -> str:
         return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"
+
+
+def _regressors(said: Array, w: Array) -> Array:
+    """u of each pad."""
+    return np.concatenate([said[:, None], np.tile(_PRIOR_STD * w, (len(said), 1))], axis=-1)
 
 
 def _covariance(D: Array, variance: Array) -> Any:
