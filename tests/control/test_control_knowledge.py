@@ -19,6 +19,7 @@ from torch_ekm.control import (
     PoseTarget,
 )
 from torch_ekm.control.knowledge import previous
+from torch_ekm.control.model_error import ModelError
 from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
@@ -104,7 +105,7 @@ def test_what_motions_taught_can_be_taken_back(driven) -> None:
         states.append({name: value.clone() for name, value in knowledge.state_dict().items()})
         knowledge.checkpoint()
         knowledge.servo.update(*torch.full((2, n_a), 0.01 * (motion + 1), dtype=torch.float64))
-        knowledge.forces.update(torch.full((n_a,), 0.01), torch.ones(5), torch.ones(5, n_a))
+        knowledge.forces.update(torch.full((n_a,), 0.01), torch.ones(5), torch.ones(5), 0.1)
         knowledge.error.square.fill_(0.01 * motion)
 
     def as_before(motion: int) -> bool:
@@ -188,14 +189,14 @@ def test_whatever_is_learned_can_be_loaded(generator) -> None:
     still = torch.rand(300, 4, generator=generator) < 0.4
     for motion in range(300):
         servo.update(draw(4), draw(4) * ~still[motion])
-        forces.update(draw(4), draw(3), draw(3, 4))
+        forces.update(draw(4), draw(3), draw(3), 0.1)
         figures.update(draw(5), draw(5, n), draw(5).square() + 1e-6)
         for part in (servo, forces, figures):
             assert part.state_problems(part.state_dict()) == []
     S, w = torch.full((1, 1), 5.0).double(), torch.full((1,), 0.1).double()
     pad = ForceSensitivity(1, 1)
     for _ in range(200):  # one that answers fifty times as much as it is described to
-        pad.update(w, 50 * S @ w, S)
+        pad.update(w, 50 * S @ w, S @ w, 0.0)
     assert 4 < float(pad.theta.abs().max()) <= 5
     assert pad.state_problems(pad.state_dict()) == []
     ideal = ServoModel("a")
@@ -253,3 +254,36 @@ def test_what_is_believed_is_shown(driven, tmp_path) -> None:
     assert CliRunner().invoke(app, ["knowledge", str(path), "--reset", "servo"]).exit_code == 0
     assert not bool(HandKnowledge.load(path).servo.estimate.any())
     assert bool(HandKnowledge.load(previous(path)).servo.estimate.any())
+
+
+def test_a_file_of_forces_with_a_drift_is_read(driven, tmp_path: Path) -> None:
+    """Before l, the drift of each pad was kept, and theta had an entry less."""
+    knowledge = HandKnowledge.of(driven.controller.kinematic.hand)
+    knowledge.load_state_dict(driven.knowledge.state_dict())
+    state = {name: value.clone() for name, value in knowledge.state_dict().items() if name != "error.tighter"}
+    at = [0, *range(2, state["forces.theta"].shape[-1])]
+    older = {
+        **state,
+        "forces.theta": state["forces.theta"][:, at],
+        "forces.evidence": state["forces.evidence"][:, at][:, :, at],
+        "forces.drift": torch.zeros(len(state["forces.theta"])),
+    }
+    knowledge.load_state_dict(older)
+    found = knowledge.state_dict()
+    for name in ("theta", "evidence"):
+        kept = state[f"forces.{name}"].clone()
+        kept[:, 1] = 0
+        if name == "evidence":
+            kept[:, :, 1] = 0
+        assert torch.equal(found[f"forces.{name}"], kept)
+
+
+def test_a_hand_that_dropped_an_object_grips_the_next_one_tighter() -> None:
+    error = ModelError()
+    error.slid(lost=True)
+    assert float(error.tighter) == 1.5
+    error.begin()
+    assert float(error.tighter) == pytest.approx(1.05)
+    for _ in range(9):
+        error.slid()
+    assert float(error.tighter) == 3.0

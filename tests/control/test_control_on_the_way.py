@@ -63,6 +63,20 @@ def test_force_and_loss_stop_it_at_once(watch) -> None:
     assert watch.why == "the object is lost"
 
 
+def test_a_finger_that_keeps_less_than_half_of_what_was_planned_stops_it(unchecked) -> None:
+    """From 4 N to 2 N in the first of two pieces, and back in the second."""
+    start, low = (torch.tensor([x, 0.1], dtype=torch.float64) for x in (4.0, 2.0))
+    twist = torch.zeros(6, dtype=torch.float64)
+    pieces = tuple(Piece(None, 10 * DEG * X[:2], twist, twist, force) for force in (low, start))
+    decision = Decision(0 * X[:2], StopReason.RUNNING, X[:1], twist, twist, pieces)
+    watch = OnTheWay(Guards(), seen_at(0.0, 0.0, fingertip_force=start), decision)
+    for done, force in ((0.25, 1.6), (0.5, 1.09), (0.75, 1.6), (1.0, 2.1)):
+        found = torch.tensor([force, 0.0], dtype=torch.float64)  # the other pad does not touch
+        assert watch(seen_at(done, done, fingertip_force=found)), done
+    assert not watch(seen_at(1.1, 0.75, fingertip_force=torch.tensor([1.4, 0.0], dtype=torch.float64)))
+    assert watch.why == "a finger keeps 1.4 N of 3.0 N"
+
+
 def test_two_frames_running_off_the_path_stop_it_and_one_does_not(watch) -> None:
     """3 deg: four deviations of 0.5 deg, and 1 deg that an object swings."""
     assert watch(seen_at(0.1, 0.5, 10.0 + 2.9))

@@ -31,7 +31,7 @@ def doors(held) -> dict[str, Door]:
     ekm, lin = EnhancedModel.for_grasp(model, state), model.linearize(state)
     controller, target = LookAndMoveController(ekm, axis), PoseTarget.turned(state, axis, degrees=5)
     still, moved = torch.zeros(9, dtype=torch.float64), torch.zeros(state.n_s, dtype=torch.float64)
-    S, f = torch.zeros(5, 9, dtype=torch.float64), torch.zeros(5, dtype=torch.float64)
+    f = torch.zeros(5, dtype=torch.float64)
     found: dict[str, Door] = {
         "model": (model, [state, still]),
         "model.linearize": (model.linearize, [state]),
@@ -48,7 +48,7 @@ def doors(held) -> dict[str, Door]:
         "decide": (controller.decide, [state, seen.a, target]),
         "reachability": (lambda wrong: reachability(controller, seen, wrong), [target]),
         "servo.update": (known.servo.update, [still, still]),
-        "forces.update": (known.forces.update, [still, f, S]),
+        "forces.update": (known.forces.update, [still, f, f, 0.1]),
         "figures.learn": (known.figures.learn, [lin, still, moved]),
     }
     for learner in (SparseOnlineGP(3, 2), default_learner(3, 2), RecursiveLeastSquares(3, 2)):

@@ -27,7 +27,7 @@ def taught(
     draw = torch.Generator().manual_seed(1)
     for one in w:
         error = noise * torch.randn(len(true), dtype=F64, generator=draw)
-        learner.update(one, true @ one + error, described)
+        learner.update(one, true @ one + error, described @ one, 0.0)
     return learner
 
 
@@ -43,7 +43,7 @@ def test_it_scales_what_a_stiffer_description_says_everywhere() -> None:
     learner, draw = ForceSensitivity(1, 3), torch.Generator().manual_seed(2)
     for w in moves(40):
         S = 20 * torch.randn(1, 3, dtype=F64, generator=draw)
-        learner.update(w, 0.4 * S @ w, S)
+        learner.update(w, 0.4 * S @ w, S @ w, 0.0)
     S = torch.tensor([[10.0, -20.0, 5.0]], dtype=F64)
     assert float(learner.scale) == pytest.approx(0.4, abs=0.03)
     torch.testing.assert_close(learner.corrected(S, [0]), 0.4 * S, atol=1.0, rtol=0)
@@ -65,8 +65,8 @@ def test_motions_in_one_direction_do_not_fade_what_others_said() -> None:
     one = torch.tensor([0.1, 0.0, 0.0], dtype=F64)
     before = learner.evidence.clone()
     for _ in range(300):
-        learner.update(one, true @ one, described)
-    assert float(learner.evidence[0, 1, 1]) > 0.5 * float(before[0, 1, 1])
+        learner.update(one, true @ one, described @ one, 0.0)
+    assert float(learner.evidence[0, 2, 2]) > 0.5 * float(before[0, 2, 2])
     torch.testing.assert_close(learner.correction, true, atol=0.5, rtol=0)
 
 
@@ -75,29 +75,31 @@ def test_a_pad_that_does_not_measure_learns_nothing_and_a_slip_little() -> None:
     learner = taught(true, described, moves(30))
     before = learner.correction.clone()
     w = moves(1, seed=5)[0]
-    r = learner.update(w, torch.tensor([NAN, float(true[1] @ w)], dtype=F64), described)
+    r = learner.update(w, torch.tensor([NAN, float(true[1] @ w)], dtype=F64), described @ w, 0.0)
     assert math.isnan(float(r[0]))
     assert torch.equal(learner.correction[0], before[0])
-    learner.update(w, true @ w - 50.0, described)  # it lets go
+    learner.update(w, true @ w - 50.0, described @ w, 0.0)  # it lets go
     assert float((learner.correction - before).abs().max()) < 10.0
 
 
 def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> None:
     true, described = torch.full((2, 3), 5.0, dtype=F64), torch.zeros(2, 3, dtype=F64)
-    learner = taught(true, described, moves(5))
+    learner, nothing = taught(true, described, moves(5)), torch.zeros(2, dtype=F64)
     kept = {name: value.clone() for name, value in learner.state_dict().items()}
     with pytest.raises(ShapeError, match="change"):
-        learner.update(moves(1)[0], torch.zeros(3, dtype=F64), described)
+        learner.update(moves(1)[0], torch.zeros(3, dtype=F64), nothing, 0.0)
     with pytest.raises(NonFiniteError, match="moved"):
-        learner.update(torch.full((3,), NAN, dtype=F64), torch.zeros(2, dtype=F64), described)
-    learner.update(torch.zeros(3, dtype=F64), torch.zeros(2, dtype=F64), described)  # nothing moved
+        learner.update(torch.full((3,), NAN, dtype=F64), torch.zeros(2, dtype=F64), nothing, 0.0)
+    with pytest.raises(NonFiniteError, match="way"):
+        learner.update(moves(1)[0], nothing, nothing, NAN)
+    learner.update(torch.zeros(3, dtype=F64), nothing, nothing, 0.0)  # nothing moved
     assert all(torch.equal(value, kept[name]) for name, value in learner.state_dict().items())
     other = ForceSensitivity(2, 3)
     of_a_file = {**kept, "variance": torch.full((2,), 0.25**2, dtype=F64)}  # of a smaller noise
     assert not other.state_problems(of_a_file)
     other.load_state_dict(kept)
     for each in (learner, other):
-        each.update(moves(1, seed=9)[0], torch.ones(2, dtype=F64), described)
+        each.update(moves(1, seed=9)[0], torch.ones(2, dtype=F64), nothing, 0.1)
     assert torch.equal(other.correction, learner.correction)
 
 
@@ -116,5 +118,18 @@ def test_a_pad_that_joins_later_learns_as_fast_as_the_first() -> None:
     for k, one in enumerate(w):
         change = true @ one
         change[1] = NAN if k < 100 else change[1]
-        learner.update(one, change, described)
+        learner.update(one, change, described @ one, 0.0)
     torch.testing.assert_close(learner.correction, true, atol=1.0, rtol=0)
+
+
+def test_what_is_lost_as_the_object_turns_either_way_is_no_answer_to_the_actuators() -> None:
+    """6 N a radian, of turns to and fro whose answers cancel."""
+    true, learner = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), ForceSensitivity(1, 3)
+    for k, one in enumerate(moves(60)):
+        way = 0.05 + 0.2 * (k % 3)
+        learner.update(one, true @ one - 6.0 * way, torch.zeros(1, dtype=F64), way)
+    assert float(learner.by_way) == pytest.approx(-6.0, abs=0.3)
+    torch.testing.assert_close(learner.correction, true, atol=0.5, rtol=0)
+    still, w = torch.zeros(1, dtype=F64), torch.zeros(3, dtype=F64)
+    assert float(learner.spread(w, still, 0.0)) == pytest.approx(float(learner.variance.sqrt()))
+    assert float(ForceSensitivity(1, 3).spread(w, still, 0.5)) == pytest.approx(math.hypot(0.3, 0.45 * 5.0))

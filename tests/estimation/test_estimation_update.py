@@ -83,15 +83,16 @@ def test_the_parameters_follow_the_recursion_of_their_docstring(draw) -> None:
 def test_forces_are_learned_by_least_squares_with_directional_forgetting(draw) -> None:
     n_pads, n_a = 2, 3
     learner = ForceSensitivity(n_pads, n_a)
-    eye = np.eye(1 + n_a)
-    theta, D, s2 = np.zeros((n_pads, 1 + n_a)), np.zeros((n_pads, 1 + n_a, 1 + n_a)), np.full(n_pads, 0.3**2)
+    n, s2 = 2 + n_a, np.full(n_pads, 0.3**2)
+    theta, D, eye = np.zeros((n_pads, n)), np.zeros((n_pads, n, n)), np.eye(n)
     for k in range(80):
         w, S = 0.1 * draw.normal(size=n_a), 10 * draw.normal(size=(n_pads, n_a))
-        change = 0.6 * S @ w + 0.3 * draw.normal(size=n_pads) - 20.0 * (k == 50)
+        way = 0.1 * draw.uniform()
+        change = 0.6 * S @ w - 8.0 * way + 0.3 * draw.normal(size=n_pads) - 20.0 * (k == 50)
         change[1] = np.nan if k % 4 == 0 else change[1]
-        learner.update(*map(torch.from_numpy, (w, change, S)))
+        learner.update(*map(torch.from_numpy, (w, change, S @ w)), way)
         for pad in np.flatnonzero(~np.isnan(change)):
-            u = np.concatenate([[S[pad] @ w], 20 * w])
+            u = np.concatenate([[S[pad] @ w, 10 * way], 20 * w])
             r = change[pad] - S[pad] @ w - u @ theta[pad]
             doubt = u @ np.linalg.solve(D[pad] / s2[pad] + eye, u)
             r = np.clip(r, -4 * np.sqrt(s2[pad] + doubt), 4 * np.sqrt(s2[pad] + doubt))

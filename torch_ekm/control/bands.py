@@ -47,7 +47,7 @@ class Bands:
         n_pads = len(controller.kinematic.hand.pads)
         self._force = seen.fingertip_force
         self._slopes: Array | None = None  # G
-        self._g, self._way = np.zeros(6), np.zeros(3)
+        self._g, self._way, self._turned = np.zeros(6), np.zeros(3), 0.0
         self._pull = torch.zeros_like(seen.a)
         self._said = torch.zeros(n_pads, dtype=torch.float64)  # S w
         self._swing = torch.zeros(n_pads, dtype=torch.float64)  # sum |df|
@@ -57,6 +57,7 @@ class Bands:
         """One more piece, which leads to a state."""
         controller, focus = self._controller, self._controller.focus
         self._way = self._way + piece.increment[-3:].numpy()
+        self._turned += float(piece.increment[-3:].norm())
         self._pull = self._pull + piece.action
         covariance, figures = self._of_model(), self._knowledge.figures
         if controller.enhanced is not None:
@@ -75,18 +76,18 @@ class Bands:
 
     def _of_forces(self, piece: Piece) -> tuple[Tensor | None, Tensor | None]:
         """Forces of the pads that touched at the start and their deviations; None: not measured."""
-        if self._force is None or piece.force is None:
+        if self._force is None or piece.force is None or piece.said is None:
             return None, None
-        rows, pads = self._controller.kinematic.hand.pad_rows(piece.linearization.contacts.finger)
+        _, pads = self._controller.kinematic.hand.pad_rows(piece.linearization.contacts.finger)
         self._pads = pads if self._pads is None else self._pads
-        self._said[pads] += (piece.linearization.described_normal_sensitivity @ piece.action)[rows]
+        self._said += piece.said
         self._swing += (piece.force - self._force).abs().nan_to_num()
         self._force = piece.force
         force = torch.full_like(piece.force, torch.nan)
         force[self._pads] = piece.force.nan_to_num()[self._pads]
         spread = torch.full_like(force, NOISE.force)
         if self._controller.forces is not None:  # else nothing is learned of them
-            spread = self._knowledge.forces.spread(self._pull, self._said)
+            spread = self._knowledge.forces.spread(self._pull, self._said, self._turned)
         return force, (spread.square() + (_SHARE * self._swing).square()).sqrt()
 
     def _of_model(self) -> Array:

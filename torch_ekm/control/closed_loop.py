@@ -33,7 +33,7 @@ from .safety.on_the_way import OnTheWay
 from .safety.safety import Objection
 from .safety.watch import Watch
 
-_GRIPS = 2  # movements that only grip, before the first turn
+_GRIPS, _AGAIN = 2, 4  # movements that only grip, before the first turn and in all, one after each turn
 _FULL, _LEAST = 0.75, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
 
 
@@ -182,7 +182,7 @@ class ClosedLoop:
                 watch = Watch(self.safety.guards, controller.kinematic, self.safety.rule.tolerance,
                               self.knowledge.servo)  # fmt: skip
                 stop = yield from self._movements(target, watch)
-                if watch.lie:
+                if watch.lie or stop.reason is StopReason.WRONG_WAY:
                     self.learned.restore(known)
                     stop = stop.told(watch.lie)
                 return stop
@@ -201,8 +201,8 @@ class ClosedLoop:
         first = watch.first(self.plant.observe(), self.plant.observe)
         seen, halt = first.seen, first.halt
         self.controller.reset()
-        self.knowledge.forces.begin()
         self.knowledge.error.begin()
+        self.controller.tighter = float(self.knowledge.error.tighter)
         self._figures.begin(seen.a)
         ends = Ends(self.safety.rule, target, self.controller.focus, seen)
         grips = turns = 0
@@ -215,6 +215,8 @@ class ClosedLoop:
             over = ends.over(seen, looks)
             if over is not None:
                 why = over.message
+                if over.reason is StopReason.OBJECT_LOST:
+                    self.knowledge.error.slid(lost=True)
                 if over.reason is StopReason.STALLED:
                     why = hindrances(seen, decision, self.controller.kinematic)
                 return Stop(over.reason, seen, why)
@@ -225,7 +227,10 @@ class ClosedLoop:
                 if against:
                     return Stop(StopReason.OUT_OF_REACH, seen, against)
             began = time.perf_counter()
-            firm = 0.0 if grips >= _GRIPS else _LEAST if turns else _FULL
+            if turns:
+                firm = _LEAST if grips < _AGAIN and decision is not None and decision.turns else 0.0
+            else:
+                firm = _FULL if grips < _GRIPS else 0.0
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:

@@ -133,7 +133,13 @@ class LookAndMoveController:
                 g, variance = self.enhanced.correction(one.state, w, len(nominal))
                 deviation = deviation + variance.sqrt()  # g errs alike along a path
             f, both = f.plus(nominal), both.plus(nominal + g)
-            made.append(Piece(one.linearization, w, nominal, nominal + g, one.force))
+            said = one.said
+            if said is not None:
+                rows, pads = self.kinematic.hand.pad_rows(one.linearization.contacts.finger)
+                said = said.index_add(
+                    0, torch.tensor(pads), (one.linearization.described_normal_sensitivity @ part)[rows]
+                )
+            made.append(Piece(one.linearization, w, nominal, nominal + g, one.force, said))
         nominal, increment = made[0].nominal, made[0].increment
         if len(made) > 1:
             nominal, increment = f.minus(start), both.minus(start)
@@ -284,7 +290,8 @@ class LookAndMoveController:
         if self.forces is not None:
             rows, pads = hand.pad_rows(lin.contacts.finger)
             drift = np.zeros(len(lin.contacts.finger))
-            drift[rows] = as_array(self.forces.drift[pads])
+            way = (self.focus.matrix.mT @ desired)[3:].norm()
+            drift[rows] = as_array(way * self.forces.by_way[pads])
             seen = dataclasses.replace(seen, drift=drift)
         return seen if self._wanted is None else dataclasses.replace(seen, grip=self._wanted(lin, seen))
 
@@ -297,7 +304,10 @@ class LookAndMoveController:
         slack = float(np.abs(solution.slack).max(initial=0.0))
         asked = float((self.focus.tolerance_scale * seen.desired).abs().max())
         limited = slack > 0.05 * asked and self._at_limit(seen.a, da, problem)
-        piece = Piece(lin, da, lin.step(da), predicted, self._force_after(lin, seen, da))
+        said = da.new_zeros(len(seen.hand.pads))
+        rows, pads = seen.hand.pad_rows(lin.contacts.finger)
+        said[pads] = (lin.described_normal_sensitivity @ da)[rows]
+        piece = Piece(lin, da, lin.step(da), predicted, self._force_after(lin, seen, da), said)
         return Decision(
             da, StopReason.RUNNING, seen.desired, predicted, lin.described_jacobian @ da, (piece,), limited,
             slack, grip=self.grip(lin, seen),
@@ -310,7 +320,9 @@ class LookAndMoveController:
             return None
         rows, pads = seen.hand.pad_rows(lin.contacts.finger)
         force = da.new_full((len(seen.hand.pads),), torch.nan)
-        force[pads] = (torch.from_numpy(f_n) + lin.normal_force_sensitivity @ da)[rows]
+        force[pads] = (
+            torch.from_numpy(f_n + seen.drift_of(list(range(len(f_n))))) + lin.normal_force_sensitivity @ da
+        )[rows]
         return force
 
     def grip(self, lin: Linearization, seen: Situation) -> Grip | None:

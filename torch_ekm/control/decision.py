@@ -87,6 +87,8 @@ class Piece:
     """(f + g)(s, w) [rad, m, rad]."""
     force: Float[Tensor, " n_pads"] | None = None
     """Normal forces after it [N]; None: not predicted."""
+    said: Float[Tensor, " n_pads"] | None = None
+    """Their change by the model alone, without what was learned of it [N]."""
 
     @property
     def state(self) -> GraspState:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+import torch
 from torch import nn
 
 from .._files import write_whole
@@ -161,9 +162,20 @@ class HandKnowledge(Recorded, nn.Module):
 
 
 def _of_now(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Older files have a pace in place of the error of the model."""
-    kept = {name: value for name, value in state.items() if name != "pace"}
-    return kept if len(kept) == len(state) else {**kept, "error.square": ModelError().square}
+    """Older files have a pace in place of the error of the model, and a drift of forces in place of l."""
+    if not state.keys() & {"pace", "error.square"}:  # of something else
+        return dict(state)
+    kept = {name: value for name, value in state.items() if name not in ("pace", "forces.drift")}
+    of_now = {f"error.{name}": value for name, value in ModelError().state_dict().items()}
+    if "forces.drift" in state:
+        theta, evidence = kept["forces.theta"], kept["forces.evidence"]
+        at = [0, *range(2, 1 + theta.shape[-1])]
+        kept["forces.theta"] = theta.new_zeros(*theta.shape[:-1], 1 + theta.shape[-1])
+        kept["forces.theta"][:, at] = theta
+        wider = evidence.new_zeros(len(theta), *2 * kept["forces.theta"].shape[-1:])
+        wider[:, torch.tensor(at)[:, None], at] = evidence
+        kept["forces.evidence"] = wider
+    return {**of_now, **kept}
 
 
 def previous(path: str | os.PathLike) -> Path:

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
 
-_SLIP = 0.5  # [N] by which the grip is tightened where the object moved otherwise than predicted:
-_SLIPS, _OF_WAY = 3.0, 0.3  # noises, and share of the way, from which it is thought to slide
+_SLIPS, _OF_WAY = 3.0, 0.15  # noises, and share of the way, from which an object is thought to slide
 _OF_IT, _WRONG = 0.25, 3.0  # share of what a finger bears that is no surprise; deviations that are one
 
 
@@ -79,7 +78,8 @@ class Lessons:
         if decision.turns:
             self._knowledge.error.see(off, way)
             if float(off.norm()) > _SLIPS * NOISE.rotation + _OF_WAY * float(way.norm()):
-                self._controller.tighter += _SLIP
+                self._knowledge.error.slid()
+                self._controller.tighter = float(self._knowledge.error.tighter)
 
     def learn(
         self,
@@ -129,11 +129,9 @@ class Lessons:
         return report
 
     def _learn_forces(self, expected: Expectation, surprise: ForceSurprise) -> None:
-        forces, names = self._knowledge.forces, expected.pieces[0].linearization.contacts.finger
-        rows, pads = self._controller.kinematic.hand.pad_rows(names)
-        change, described = torch.full_like(forces.drift, torch.nan), torch.zeros_like(forces.correction)
-        change[pads] = surprise.change
-        for one, share in zip(expected.pieces, expected.shares, strict=True):
-            if one.linearization.contacts.finger == names:
-                described[pads] += share * one.linearization.described_normal_sensitivity[rows]
-        forces.update(expected.moved, change, described)
+        forces, said = self._knowledge.forces, [one.said for one in expected.pieces if one.said is not None]
+        change = torch.full_like(forces.by_way, torch.nan)
+        change[list(surprise.pads)] = surprise.change
+        way = sum(float(one.increment[-3:].norm()) for one in expected.pieces)
+        if said:
+            forces.update(expected.moved, change, torch.stack(said).sum(0), way)

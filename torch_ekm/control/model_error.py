@@ -15,6 +15,8 @@ from ..typing import Float, Tensor
 _START = 0.1, 0.2  # along and across, of a hand of which nothing is known
 _RECENT = 0.25  # weight of the last motion,
 _WHOLE = math.radians(2.5)  # if it is as long as this [rad]
+_SLIP, _LOSS, _MOST = 0.5, 1.5, 3.0  # [N] by which is gripped tighter, and at most
+_FORGETS = 0.7  # share of it that is left in the next turn
 STEADY = math.radians(0.4)  # [rad] of a motion as measured: two poses, and a pad that creeps as it settles
 
 
@@ -31,6 +33,8 @@ class ModelError(Recorded, nn.Module):
         super().__init__()
         self.square = nn.Buffer(torch.tensor([along**2 for along in _START], dtype=torch.float64))
         """s^2, along and across."""
+        self.tighter = nn.Buffer(torch.zeros((), dtype=torch.float64))
+        """Grip on top of what suits the object, which has slid or was lost [N]."""
 
     @property
     def along(self) -> float:
@@ -45,6 +49,11 @@ class ModelError(Recorded, nn.Module):
     def begin(self) -> None:
         """A new turn: what slid in the last one is no part of it."""
         self.square.copy_(torch.minimum(self.square, self.square.new_tensor(_START).square()))
+        self.tighter *= _FORGETS
+
+    def slid(self, lost: bool = False) -> None:
+        """The object has slid in the fingers, or is lost: it is gripped tighter."""
+        self.tighter.copy_((self.tighter + (_LOSS if lost else _SLIP)).clamp(max=_MOST))
 
     def see(self, error: Float[Tensor, " 3"], way: Float[Tensor, " 3"]) -> None:
         """Learn from one movement.
@@ -64,7 +73,7 @@ class ModelError(Recorded, nn.Module):
 
     def state_problems(self, state: Mapping[str, Any]) -> list[str]:
         """What is wrong with the entries of a state that is to be loaded."""
-        return bound_problems(state, square=(0, 1))
+        return bound_problems(state, square=(0, 1), tighter=(0, _MOST))
 
     def extra_repr(self) -> str:
         return f"along={self.along:.2g}, across={self.across:.2g}"

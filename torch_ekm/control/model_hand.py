@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
+from collections.abc import Mapping
 
 import torch
 
@@ -62,6 +63,9 @@ class ModelHand:
         self._way = self.a.new_zeros(self.hand.n_a)
         self.increment = self.correction = self.a.new_zeros(self.state.n_s)
         """Of the last motion, and g's part of it [rad, m, rad]."""
+        self.said = self.a.new_zeros(len(self.hand.pads))
+        """Change of the normal forces in it, by the model alone [N]."""
+        self._bears = self.said  # what the model thinks that the pads bear: other than they measure
         self._measured, self._stands = force is not None, False
         self.force = self.a.new_zeros(len(self.hand.pads)) if force is None else force
         self._stand()
@@ -120,6 +124,9 @@ class ModelHand:
             if not lin.forces.solved:
                 self.failure = GraspEndsError(str(lin.doubts[0]))
             self._motion, self._linearization = ContactMotion(self.kinematic, lin), lin
+            self._bears = self._of_pads(
+                dict(zip(lin.contacts.finger, lin.forces.normal.tolist(), strict=True))
+            )
         except GraspError as error:
             self.failure = error
 
@@ -139,12 +146,21 @@ class ModelHand:
         self.increment = motion.state.minus(self.state)
         self.correction = torch.zeros_like(self.increment) if correction is None else correction
         self.state, self.a = motion.state, self.a + w
-        pads = [pad.name for pad in self.hand.pads]
-        before, force = self.force, self.force.new_tensor([step.normal.get(pad, 0.0) for pad in pads])
-        self.force = force
-        if self._forces is not None:
+        bears = self._of_pads(step.normal)
+        before, self.said, self._bears = self.force, bears - self._bears, bears
+        self.force = bears
+        if self._measured:
             least = self.kinematic.options.forces.normal_std
-            bear = (before > least) & (force > least)
-            learned = before + self._forces.scale * (force - before) + self._forces.correction @ w
-            self.force = force.where(~bear, learned.clamp(min=least))
-            self._measured, self._stands = True, False
+            change = self.said
+            if self._forces is not None:
+                turn = self.increment[-3:].norm()
+                change = (
+                    self._forces.scale * change + self._forces.correction @ w + self._forces.by_way * turn
+                )
+                self._stands = False
+            bear = (before > least) & (bears > least)
+            self.force = bears.where(~bear, (before + change).clamp(min=least))
+
+    def _of_pads(self, normal: Mapping[str, float]) -> Tensor:
+        """Of each pad of the hand, 0 of one that does not touch [N]."""
+        return self.a.new_tensor([normal.get(pad.name, 0.0) for pad in self.hand.pads])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 
+from .._noise import NOISE
 from ..kinematics import GraspState
 from ..plant import Observation
 from .bands import Band, Bands
@@ -28,6 +29,7 @@ _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was
 _HOLDS = 0.05  # of its friction that each finger has to spare, for a step of which the model is not sure
 _BACK = 1.5  # times off_rotation from which an object that is farther off is not turned back: it slips out
 _GRIP = 3  # pieces of a movement that grips: pads that read wrong are seen after it
+_LOOSENS = 0.8  # of a finger's force that a grip leaves at least
 _CLOSE = 0.3 * _DEG  # [rad] from which one is enough
 
 
@@ -201,10 +203,10 @@ class WholeTurn:
         end = End() if nearest[0] < _CLOSE else rehearsal.end
         del waypoints[nearest[1] :]
         safe = min(safe, len(waypoints))
-        if not waypoints:  # the model does not go anywhere from here: one step to first order
-            decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
-            return Plan(target, focus, seen.state, decision, end=end)
-        decision = self._movement(controller, seen, target, rehearsal, waypoints[:safe], against)
+        if safe:
+            decision = _joined(controller, seen, waypoints[:safe], rehearsal)
+        else:
+            decision = self._one_step(controller, seen, target, bool(waypoints), against)
         return Plan(target, focus, seen.state, decision, tuple(waypoints), safe, end, against)
 
     def _against(self, band: Band, most: float, first: bool) -> str:
@@ -234,31 +236,35 @@ class WholeTurn:
             if not waypoints and not _loose(rehearsal.first, firm):
                 return None
             waypoint = Waypoint(piece, state, bands.add(piece, state))
-            if len(waypoints) == _GRIP or self._off(waypoint.band, self.off_rotation):
+            loosens = _loosens(seen, piece)
+            if len(waypoints) == _GRIP or loosens or self._off(waypoint.band, self.off_rotation):
                 break
             waypoints.append(waypoint)
-        if not waypoints:
+        if waypoints:
+            return dataclasses.replace(_joined(controller, seen, waypoints, rehearsal), turns=False)
+        if rehearsal.hand.failure is None:
             return None
-        return dataclasses.replace(_joined(controller, seen, waypoints, rehearsal), turns=False)
+        decision = controller.decide(seen.state, seen.a, here, seen.fingertip_force)  # the model refuses
+        loose = decision.status is StopReason.RUNNING and _loose(decision, firm)
+        return dataclasses.replace(decision, turns=False) if loose else None
 
-    def _movement(
+    def _one_step(
         self,
         controller: LookAndMoveController,
         seen: Observation,
         target: PoseTarget,
-        rehearsal: Rehearsal,
-        waypoints: list[Waypoint],
+        modelled: bool,
         against: str,
     ) -> Decision:
-        """To the last safe waypoint; where there is none one step to first order, if the object is where it
-        should be."""
-        if waypoints:
-            return _joined(controller, seen, waypoints, rehearsal)
+        """Where no waypoint is safe, or the model refuses the first piece: one step to first order, if the
+        object stays where it should be. Friction margins are no reason where the model refuses what the hand
+        holds: fingertips that read wrong use them up."""
         decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
         if decision.status is not StopReason.RUNNING:
             return decision
         lin = decision.pieces[0].linearization
-        holds = not lin.forces.solved or float(lin.forces.relative_margin.min()) > _HOLDS
+        holds = not (modelled and lin.forces.solved) or float(lin.forces.relative_margin.min()) > _HOLDS
+        holds &= decision.grip is None or float(decision.grip.force.min()) > self.force
         after = controller.focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
         if after > self.off_rotation or not holds:
             return controller.none(StopReason.GIVEN_UP, against, decision.desired)
@@ -281,6 +287,15 @@ def _joined(
         limited=last is not None and last.limited,
         grip=None if first is None else first.grip,
         band=waypoints[-1].band,
+    )
+
+
+def _loosens(seen: Observation, piece: Piece) -> bool:
+    """A piece that is to grip takes force from a finger."""
+    if seen.fingertip_force is None or piece.force is None:
+        return False
+    return bool(
+        ((piece.force < _LOOSENS * seen.fingertip_force) & (seen.fingertip_force > NOISE.pressing)).any()
     )
 
 

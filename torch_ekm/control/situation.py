@@ -40,7 +40,8 @@ class Situation:
     tighter: float = 0.0
     """Wanted on top of the grip that suits the object [N]."""
     drift: Array | None = None
-    """By which the normal forces change more than the model says, with each motion [N]; None: 0."""
+    """By which the normal forces change as the object turns by :attr:`desired`, whatever the motors do [N];
+    None: 0."""
     grip: float | None = None
     """Wanted of the finger that opposes the others, see :class:`GripForceTask` [N]; None: nothing."""
 

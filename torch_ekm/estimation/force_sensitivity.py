@@ -9,35 +9,33 @@ import numpy as np
 import torch
 from torch import nn
 
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_kind, check_shape
 from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
 from .update import update
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
+_WAY_STD = 10.0  # [N/rad] of an entry of l
 _LARGEST_STD = 20.0  # [N] of a change of force that c and B do not explain
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
 _USUAL = 1 / 0.45**2 - 1  # information on theta that hands have in common, on top of the prior's
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
-_KEPT, _TAKEN = 0.5, 0.3  # of the drift before, of the last motion
 
 
 class ForceSensitivity(Recorded, nn.Module):
-    """``f_n+ - f_n = (c S + B) w + noise``, S ``= df_n/da`` of the model: by recursive least squares::
+    """``f_n+ - f_n = (c S + B) w + l |phi| + noise``, S ``= df_n/da``: by recursive least squares::
 
-        u = [S w; 20 w],  theta = [c - 1; B / 20]        prior N(0, I)
+        u = [S w; 10 |phi|; 20 w],  theta = [c - 1; l / 10; B / 20]        prior N(0, I)
         r = (f_n+ - f_n) - S w - theta u                 of each pad that measures
         D <- D - (1 - .97) D u u' D / (u' D u)           motions, forgotten in the direction of a new one
         theta <- update(theta, (D / s^2 + I)^-1, r, u', s^2),  D <- D + u u'
-        d <- .5 d + .3 r                                 what motions in succession leave alike
         s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .3^2)       what is left: a pad that rubs teaches less
 
-    c of each pad scales what the model says: a hand that gives more than it is described to presses less. B
-    ``(n_pads, n_a)`` says the rest. Both belong to the hand: they are kept from grasp to grasp. The drift d
-    belongs to one grasp: a finger that loses a little with each motion is pressed harder, as by integral
-    action.
+    c of each pad scales what the model says: a hand that gives more than it is described to presses less. l
+    is what a finger gains or loses as the object turns by phi either way, by friction and creep of cables and
+    joints; B ``(n_pads, n_a)`` says the rest. All belong to the hand: they are kept from grasp to grasp.
 
     Args:
         n_pads, n_a: contact pads and actuators of the hand.
@@ -47,13 +45,11 @@ class ForceSensitivity(Recorded, nn.Module):
 
     def __init__(self, n_pads: int, n_a: int) -> None:
         super().__init__()
-        self.theta = nn.Buffer(torch.zeros(n_pads, 1 + n_a, dtype=torch.float64))
-        self.evidence = nn.Buffer(torch.zeros(n_pads, 1 + n_a, 1 + n_a, dtype=torch.float64))
+        self.theta = nn.Buffer(torch.zeros(n_pads, 2 + n_a, dtype=torch.float64))
+        self.evidence = nn.Buffer(torch.zeros(n_pads, 2 + n_a, 2 + n_a, dtype=torch.float64))
         """D, of the motions that each pad measured."""
         self.variance = nn.Buffer(torch.full((n_pads,), NOISE.force**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
-        self.drift = nn.Buffer(torch.zeros(n_pads, dtype=torch.float64))
-        """d, by which a pad's force changes more than predicted, motion by motion [N]."""
 
     @property
     def scale(self) -> Float[Tensor, " n_pads"]:
@@ -69,7 +65,12 @@ class ForceSensitivity(Recorded, nn.Module):
     @property
     def correction(self) -> Float[Tensor, "n_pads n_a"]:
         """B [N/rad]."""
-        return _PRIOR_STD * self.theta[:, 1:]
+        return _PRIOR_STD * self.theta[:, 2:]
+
+    @property
+    def by_way(self) -> Float[Tensor, " n_pads"]:
+        """l, per turn of the object [N/rad]."""
+        return _WAY_STD * self.theta[:, 1]
 
     def corrected(self, described: Float[Tensor, "n_c n_a"], pads: Sequence[int]) -> Float[Tensor, "n_c n_a"]:
         """``c S + B`` [N/rad].
@@ -82,7 +83,7 @@ class ForceSensitivity(Recorded, nn.Module):
         return self.scale[at, None] * described + self.correction[at]
 
     def spread(
-        self, moved: Float[Tensor, " n_a"], said: Float[Tensor, " n_pads"]
+        self, moved: Float[Tensor, " n_a"], said: Float[Tensor, " n_pads"], way: float
     ) -> Float[Tensor, " n_pads"]:
         """``sqrt(u' P u + s^2)``: standard deviation of what is predicted for the change of each force [N].
 
@@ -92,31 +93,30 @@ class ForceSensitivity(Recorded, nn.Module):
         Args:
             moved: w [rad].
             said: S w, the change by the model alone [N].
+            way: ``|phi|``, turn of the object [rad].
         """
-        u = _regressors(said.numpy(), moved.numpy())
+        u = _regressors(said.numpy(), way, moved.numpy())
         variance = self.variance.numpy()
         known = _covariance(
             self.evidence.numpy() + _USUAL * variance[:, None, None] * np.eye(u.shape[-1]), variance
         )
         return torch.from_numpy(np.sqrt(variance + ((known @ u[..., None])[..., 0] * u).sum(-1)))
 
-    def begin(self) -> None:
-        """A new grasp: nothing drifts yet."""
-        self.drift.zero_()
-
     @torch.no_grad()
     def update(
         self,
         moved: Float[Tensor, " n_a"],
         change: Float[Tensor, " n_pads"],
-        described: Float[Tensor, "n_pads n_a"],
+        said: Float[Tensor, " n_pads"],
+        way: float,
     ) -> Float[Tensor, " n_pads"]:
         """Learn from one motion.
 
         Args:
             moved: w, of the encoders [rad].
             change: ``f_n+ - f_n`` of each pad [N]; NaN: it does not measure, or does not touch.
-            described: S, ``df_n/da`` of each pad by the model [N/rad].
+            said: S w, the change by the model alone [N].
+            way: ``|phi|``, turn of the object [rad].
 
         Returns:
             r [N], NaN where nothing was measured.
@@ -124,19 +124,19 @@ class ForceSensitivity(Recorded, nn.Module):
         Raises:
             ShapeError, NonFiniteError: nothing is changed.
         """
-        n_pads, n_a = len(self.theta), self.theta.shape[-1] - 1
+        n_pads, n_a = len(self.theta), self.theta.shape[-1] - 2
         for name, value, shape in (
-            ("moved", moved, (n_a,)), ("change", change, (n_pads,)), ("described", described, (n_pads, n_a))
+            ("moved", moved, (n_a,)), ("change", change, (n_pads,)), ("said", said, (n_pads,))
         ):  # fmt: skip
             check_shape(name, value, shape)
         check_finite("moved", moved)
-        check_finite("described", described)
-        w, df, S = (x.detach().double().numpy() for x in (moved, change, described))
-        buffers = self.theta, self.evidence, self.variance, self.drift
-        theta, D, variance, drift = (buffer.numpy() for buffer in buffers)  # their own memory
-        said = S @ w
-        u = _regressors(said, w)
-        r = df - said - (u * theta).sum(-1)
+        check_finite("said", said)
+        check_finite("way", torch.tensor(check_kind("way", way, float)))
+        w, df, answer = (x.detach().double().numpy() for x in (moved, change, said))
+        buffers = self.theta, self.evidence, self.variance
+        theta, D, variance = (buffer.numpy() for buffer in buffers)  # their own memory
+        u = _regressors(answer, way, w)
+        r = df - answer - (u * theta).sum(-1)
         known = ~np.isnan(r)
         if not known.any() or not w.any():
             return torch.from_numpy(r)
@@ -147,7 +147,6 @@ class ForceSensitivity(Recorded, nn.Module):
         D[known] -= ((1 - _FORGETTING) * Du[:, :, None] * Du[:, None, :] / seen)[known]
         most = NOISE.outlier * spread  # a contact that slips says nothing of the rest
         bounded = np.clip(r, -most, most)
-        drift[known] = (_KEPT * drift + _TAKEN * bounded)[known]
         one = bounded[:, None], u[:, None, :], variance[:, None]
         after, _ = update(theta, _covariance(D, variance), *one, bounds=(-NOISE.furthest, NOISE.furthest))
         theta[known] = after[known]
@@ -166,7 +165,7 @@ class ForceSensitivity(Recorded, nn.Module):
         )
         if wrong:
             return wrong
-        D = state["evidence"]  # of the drift a grasp makes a new one
+        D = state["evidence"]
         if bool((state["theta"].any(-1) & ~D.flatten(1).any(-1)).any()):
             return ["theta is known of a pad without evidence"]
         unit = (1e-9 + 1e-9 * D.abs().amax((-2, -1), keepdim=True)) * torch.eye(D.shape[-1], dtype=D.dtype)
@@ -176,9 +175,10 @@ class ForceSensitivity(Recorded, nn.Module):
         return f"pads={len(self.theta)}, largest={float(self.correction.abs().max()):.3g} N/rad"
 
 
-def _regressors(said: Array, w: Array) -> Array:
+def _regressors(said: Array, way: float, w: Array) -> Array:
     """u of each pad."""
-    return np.concatenate([said[:, None], np.tile(_PRIOR_STD * w, (len(said), 1))], axis=-1)
+    alike = np.concatenate([[_WAY_STD * way], _PRIOR_STD * w])
+    return np.concatenate([said[:, None], np.tile(alike, (len(said), 1))], axis=-1)
 
 
 def _covariance(D: Array, variance: Array) -> Any:

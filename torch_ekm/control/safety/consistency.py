@@ -198,6 +198,11 @@ class Consistency:
             "joints' zero"
         )
 
+    def on_surface(self, seen: Observation) -> bool:
+        """The pads that press lie on the object, as joints and pose have them."""
+        pressed = None if seen.fingertip_force is None else seen.fingertip_force > 1
+        return self._distance(seen, 0.0, pressed) <= _GAP
+
     def _distance(self, seen: Observation, offset: float, pressed: Tensor | None) -> float:
         """Of the pads from the object's surface, rms [m]; infinite: one that presses is far from it."""
         moves = torch.from_numpy(self.hand.joint_upper > self.hand.joint_lower)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from ..._noise import NOISE
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from .safety import Guards
@@ -17,13 +18,15 @@ if TYPE_CHECKING:
 _DEVIATIONS = 4.0
 _RUNNING = 2  # frames that leave the band: one may be a wrong picture
 _SWINGS = math.radians(1.0)  # [rad] by which a moving object lags behind its equilibrium
+_FADES = 0.5  # of the force that was planned, below which a finger is about to let go
 
 
 class OnTheWay:
-    """Whether a movement goes on: no finger presses too hard, the object is held, and near its path.
+    """Whether a movement goes on: no finger presses too hard or fades, the object is held, and near its path.
 
     The object's rotation in a picture is held against that of the path where the encoders were when it was
-    taken, and against the band at the end of the movement.
+    taken, and against the band at the end of the movement; forces against those of the path, of which a
+    finger keeps half and more.
 
     Args:
         guards: limits.
@@ -35,6 +38,7 @@ class OnTheWay:
         self._guards, self._seen, self._band = guards, seen, decision.band
         self._ends = torch.stack([one.action for one in decision.pieces]).cumsum(0)
         self._twists = torch.stack([one.increment[-6:] for one in decision.pieces]).cumsum(0)
+        self._forces = [one.force for one in decision.pieces]
         self._frames = [(seen.taken.encoders, seen.a)]
         self._off = 0
         self.why = ""
@@ -48,6 +52,8 @@ class OnTheWay:
             self.why = "the object is lost"
         elif force is not None and bool((force > self._guards.force_ceiling).any()):
             self.why = f"a finger presses with {float(force.max()):.1f} N"
+        elif force is not None and (fades := self._fades(seen, force)):
+            self.why = fades
         elif self._band is not None and seen.status is PlantStatus.HELD:
             turn = self._off_path(seen)[-3:]
             off = float(turn.norm())
@@ -57,17 +63,34 @@ class OnTheWay:
                 self.why = f"the object is {math.degrees(off):.1f} deg off its path"
         return not self.why
 
-    def _off_path(self, seen: Observation) -> Tensor:
-        """Twist of the object that the path does not have where the picture was taken [m, rad]."""
-        moved = self._encoders(seen.taken.pose) - self._seen.a
+    def _fades(self, seen: Observation, force: Tensor) -> str:
+        """Which finger keeps less than half of what was planned; empty: none."""
+        start = self._seen.fingertip_force
+        k, share = self._place(seen.a)
+        before, after = self._forces[k - 1] if k else start, self._forces[k]
+        if start is None or before is None or after is None:
+            return ""
+        planned = before + share * (after - before)
+        fades = (start > NOISE.pressing) & (force < _FADES * planned) & (planned - force > 3 * NOISE.force)
+        if not bool(fades.any()):
+            return ""
+        i = int((planned - force).where(fades, -math.inf).argmax())
+        return f"a finger keeps {float(force[i]):.1f} N of {float(planned[i]):.1f} N"
+
+    def _place(self, a: Tensor) -> tuple[int, float]:
+        """The piece in which the encoders are, and how much of it is done."""
         end = self._ends[-1]
-        done = min(max(float(moved @ end) / max(float(end @ end), 1e-12), 0.0), 1.0)
+        done = min(max(float((a - self._seen.a) @ end) / max(float(end @ end), 1e-12), 0.0), 1.0)
         way = self._ends @ end / (end @ end).clamp(min=1e-12)  # of each waypoint along the whole
         k = min(int((way < done).sum()), len(way) - 1)
-        before = self._twists[k - 1] if k else torch.zeros_like(self._twists[0])
         start = float(way[k - 1]) if k else 0.0
-        share = (done - start) / max(float(way[k]) - start, 1e-9)
-        planned = before + min(max(share, 0.0), 1.0) * (self._twists[k] - before)
+        return k, min(max((done - start) / max(float(way[k]) - start, 1e-9), 0.0), 1.0)
+
+    def _off_path(self, seen: Observation) -> Tensor:
+        """Twist of the object that the path does not have where the picture was taken [m, rad]."""
+        k, share = self._place(self._encoders(seen.taken.pose))
+        before = self._twists[k - 1] if k else torch.zeros_like(self._twists[0])
+        planned = before + share * (self._twists[k] - before)
         return seen.state.minus(self._seen.state)[-6:] - planned
 
     def _encoders(self, time: float) -> Tensor:

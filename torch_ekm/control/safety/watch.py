@@ -119,9 +119,9 @@ class Watch:
         if seen.status is PlantStatus.LOST:
             return Verdict(seen, False)
         if doubt is not None and not (doubt.blind or doubt.gated):
-            if doubt.reason is StopReason.POSE_JUMP:
-                self.slid = self._slid(before, expected, last, seen)
-            if not self.slid:  # empty but for a pose that jumps
+            if doubt.reason in (StopReason.POSE_JUMP, StopReason.JOINT_JUMP):
+                self.slid = self._slid(doubt.reason, before, expected, last, seen)
+            if not self.slid:  # empty but for a pose or a finger that jumps
                 return Verdict(seen, False, doubt, "", expected)
             doubt = doubt._replace(gated=True, message=self.slid)
         if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
@@ -193,16 +193,19 @@ class Watch:
 
     def _slid(
         self,
+        reason: StopReason,
         before: Observation,
         expected: Expectation | None,
         last: Observation | None,
         seen: Observation,
     ) -> str:
-        """A pose that jumps is the object's where two looks agree and the grip has changed, too."""
+        """What two looks show that agree is true of a pose where the grip has changed, too, and of a joint
+        where the pads that press lie on the object."""
         if expected is None or last is None or not agree(last, seen, self.guards):
             return ""
         surprise = felt(self.hand, expected, before, seen)
-        if surprise is None or not surprise.wrong(before):
+        changed = surprise is not None and surprise.wrong(before)
+        if not (self.consistency.on_surface(seen) if reason is StopReason.JOINT_JUMP else changed):
             return ""
         ds = (seen.state.minus(before.state) - expected.increment)[-6:]
         way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
