@@ -18,11 +18,12 @@ from torch_ekm.control import (
     PathEnd,
     PoseTarget,
 )
+from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NoContactError, ParameterError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
-from torch_ekm.simulation import SimulatedHand
+from torch_ekm.simulation import SimulatedHand, preset
 
 DEG = math.pi / 180
 
@@ -144,3 +145,21 @@ def test_a_planar_hand_reaches_as_far_as_its_plane_lets_it() -> None:
     plant.reset(0)
     controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
     assert ClosedLoop(plant, controller).reach(limit=12 * DEG).angle > 5 * DEG
+
+
+@pytest.mark.parametrize("off", ["pad", "object"])
+def test_a_pad_or_an_object_that_is_described_wrongly_by_millimetres_is_turned(off: str) -> None:
+    """The index pad is 3 mm thicker than described, or the object 15 % larger: nothing touches by the model."""
+    scale = 1.15 if off == "object" else 1.0
+    parameters = preset("nominal").replace(object_scale=scale)
+    plant = SimulatedHand("icub_right", "can", engine="mujoco", parameters=parameters)
+    seen, hand = plant.reset(0), plant.hand
+    if off == "pad":
+        thin = (
+            dataclasses.replace(pad, radius=pad.radius - 0.003 * (pad.name == "index")) for pad in hand.pads
+        )
+        hand = dataclasses.replace(hand, pads=tuple(thin))
+    ekm = EnhancedModel.for_grasp(KinematicModel(hand, plant.object), seen.state)
+    loop = ClosedLoop(plant, LookAndMoveController(ekm, plant.rotation_axis))
+    done = loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=8))
+    assert done.reason.value == "reached"

@@ -15,7 +15,7 @@ pytest.importorskip("coal")
 
 from torch_ekm.contact.contact_set import NearMiss
 from torch_ekm.description import Shape, load_hand, load_object
-from torch_ekm.exceptions import NonFiniteError, ShapeError, SingularGraspError
+from torch_ekm.exceptions import NoContactError, NonFiniteError, ShapeError, SingularGraspError
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel, ModelOptions, ModelStatus
 from torch_ekm.model.validity import _of_missing_forces
@@ -164,6 +164,30 @@ def test_pads_left_out_come_with_their_gaps():
     far = float((end("thumb") - centre).norm()) - 0.01 - pads["thumb"].radius
     assert left_out["thumb"] == pytest.approx(far, abs=2e-3)
     assert left_out["thumb"] > 0.002
+
+
+@pytest.mark.parametrize(("gap", "force", "touches"), [(5, 0.6, True), (7, 0.6, False), (5, 0.4, False)])
+def test_a_pad_that_measures_a_force_touches_whatever_the_gap(gap, force, touches):
+    """5 mm off, by an object or a pad that is described wrongly; a pad 7 mm off presses on something else."""
+    hand, box = load_hand("icub_right"), load_object("box")
+    q, kinematics = torch.zeros(hand.n_q, dtype=F64), HandKinematics(hand)
+    pad = next(pad for pad in hand.pads if pad.name == "index")
+    pose = kinematics(q).of(pad.link)
+    centre = (pose @ torch.tensor([*pad.end, 1.0], dtype=F64))[:3]
+    centre = centre + pose[:3, 0] * (0.01 + pad.radius + 1e-3 * gap)
+    ball = dataclasses.replace(box, shapes=(Shape("sphere", (0.01,), np.eye(4)),))
+    model, state = KinematicModel(hand, ball), GraspState(q, centre, torch.eye(3, dtype=F64))
+    measured = torch.tensor([force * (one is pad) for one in hand.pads], dtype=F64)
+    with pytest.raises(NoContactError):
+        model.contacts(state)
+    for found in (model.contacts, model.touching):
+        if touches:
+            assert found(state, measured).finger == ("index",)
+            assert "index" not in {near.pad for near in found(state, measured).near_misses}
+            assert found(state, measured).gap.tolist() == pytest.approx([1e-3 * gap], abs=3e-4)
+        else:
+            with pytest.raises(NoContactError):
+                found(state, measured)
 
 
 def test_the_name_of_the_actuator_that_cannot_move():

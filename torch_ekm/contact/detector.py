@@ -7,6 +7,7 @@ because the witness points of a distance query jump along a line of contact.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ from .pad_contact import Pad, PadContact, Solid, pad_contact
 
 CROWN_RADIUS = 0.5
 """R, of a pad along its axis [m]."""
+PRESSING = 0.006
+"""Gap up to which a pad touches that measures a force [m]."""
 
 
 class ContactDetector:
@@ -84,6 +87,7 @@ class ContactDetector:
         q: LinkPoses | Float[Tensor, " n_q"],
         position: Float[Tensor, " 3"],
         rotation: Float[Tensor, "3 3"],
+        pressing: Collection[str] = (),
     ) -> ContactSet:
         """Contacts in the hand frame, in the order of ``hand.pads``; empty if nothing is near.
 
@@ -91,13 +95,15 @@ class ContactDetector:
             q: joint angles [rad] of one posture, or its link poses.
             position: object point o [m].
             rotation: object orientation R.
+            pressing: pads that measure a force: they touch up to 6 mm off, by which pads and objects are
+                described wrongly.
 
         Raises:
             ShapeError: not a single posture or pose.
             NonFiniteError: an entry is NaN or infinite.
         """
         frames, solids = self._placed(q, position, rotation)
-        found, missed = self._of_pads(frames, solids, self.margin, measured=True)
+        found, missed = self._of_pads(frames, solids, self.margin, pressing, measured=True)
         missed += self._other_links.touching(frames, solids)
         return self._contact_set(found, missed, position.dtype, position.device)
 
@@ -107,8 +113,10 @@ class ContactDetector:
         position: Float[Tensor, " 3"],
         rotation: Float[Tensor, "3 3"],
         margin: float,
+        pressing: Collection[str] = (),
     ) -> ContactSet:
-        """The pads, then the links without a pad, whose gap is at most ``margin`` [m].
+        """The pads, then the links without a pad, whose gap is at most ``margin`` [m], of pads that press as
+        in a call.
 
         A link's ``finger`` is the link's own name. Its friction is that of the object.
 
@@ -116,7 +124,7 @@ class ContactDetector:
             ShapeError, NonFiniteError: as of a call.
         """
         frames, solids = self._placed(q, position, rotation)
-        found, _ = self._of_pads(frames, solids, margin, measured=False)
+        found, _ = self._of_pads(frames, solids, margin, pressing, measured=False)
         links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
         return self._contact_set(found, [], position.dtype, position.device, links)
 
@@ -142,12 +150,19 @@ class ContactDetector:
         return frames, solids
 
     def _of_pads(
-        self, frames: Array, solids: list[tuple[Solid, Array]], margin: float, *, measured: bool
+        self,
+        frames: Array,
+        solids: list[tuple[Solid, Array]],
+        margin: float,
+        pressing: Collection[str],
+        *,
+        measured: bool,
     ) -> tuple[list[tuple[int, PadContact]], list[NearMiss]]:
         """Pads within the margin, by their place in the hand, and the others; gaps only if ``measured``."""
         found, missed = [], []
         for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            contact = self._nearest(pad, frames[link], solids, margin, measured)
+            most = max(margin, PRESSING) if self.hand.pads[k].name in pressing else margin
+            contact = self._nearest(pad, frames[link], solids, most, measured)
             if isinstance(contact, PadContact):
                 found.append((k, contact))
             else:

@@ -119,7 +119,8 @@ class ModelHand:
             return
         self._stands = True
         try:
-            contacts, force = self.kinematic.touching(self.state), self.force if self._measured else None
+            force = self.force if self._measured else None
+            contacts = self.kinematic.touching(self.state, force)
             lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
             if not lin.forces.solved:
                 self.failure = GraspEndsError(str(lin.doubts[0]))

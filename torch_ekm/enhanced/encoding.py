@@ -8,7 +8,7 @@ import torch
 
 from .._checks import check_kind
 from .._recorded import Recorded
-from ..exceptions import UnknownNameError
+from ..exceptions import NoContactError, UnknownNameError
 from ..kinematics.grasp_state import A_STATE, GraspState
 from ..typing import Float, Tensor
 
@@ -42,12 +42,18 @@ class GraspEncoding(Recorded):
     def of(cls, model: KinematicModel, state: GraspState) -> GraspEncoding:
         """About ``state``, with the joints that can move a finger which touches the object.
 
+        An object or pads described wrongly may leave no pad within the margin: then those up to 6 mm off.
+
         Raises:
-            NoContactError: nothing touches the object.
+            NoContactError: nothing is as near.
         """
         hand = model.hand
         moved = torch.zeros(hand.n_q, dtype=torch.bool)
-        for link in model.contacts(state).link:
+        try:
+            contacts = model.contacts(state)
+        except NoContactError:
+            contacts = model.contacts(state, torch.full((len(hand.pads),), torch.inf))
+        for link in contacts.link:
             moved |= model.kinematics.upstream[model.link_names.index(link)]  # type: ignore[index]
         free = torch.from_numpy(hand.joint_upper > hand.joint_lower)
         return cls(state, torch.nonzero(moved & free).flatten().tolist())

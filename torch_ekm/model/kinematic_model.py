@@ -9,6 +9,7 @@ from torch import nn
 
 from .._arrays import in_numpy, is_plain, like, namespace
 from .._checks import check_kind
+from .._noise import NOISE
 from ..contact.contact_kinematics import ContactKinematics, constraint_matrix, contact_kinematics
 from ..contact.contact_set import ContactSet, Detector
 from ..contact.detector import ContactDetector
@@ -153,37 +154,58 @@ class KinematicModel(nn.Module):
         return self.linearize(state, contacts).step(delta_a)
 
     @torch.no_grad()
-    def contacts(self, state: GraspState) -> ContactSet:
+    def contacts(
+        self, state: GraspState, fingertip_force: Float[Tensor, " n_pads"] | None = None
+    ) -> ContactSet:
         """Contacts of one state, from the detector.
+
+        Args:
+            fingertip_force: normal forces as measured [N]; a pad that measures more than 0.5 N touches, up to
+                6 mm off, as far as pads and objects are described wrongly.
 
         Raises:
             NoContactError: nothing touches the object.
         """
-        return self._detect(check_kind("state", state, GraspState, A_STATE), None)
+        return self._detect(check_kind("state", state, GraspState, A_STATE), None, fingertip_force)
 
-    def _detect(self, state: GraspState, poses: LinkPoses | None) -> ContactSet:
+    def _detect(
+        self, state: GraspState, poses: LinkPoses | None, fingertip_force: Tensor | None
+    ) -> ContactSet:
         detector, place = self.detector, (state.position, state.rotation)
         with torch.no_grad():
-            if isinstance(detector, ContactDetector) and poses is not None:
-                contacts = detector(poses, *place)
+            if isinstance(detector, ContactDetector):
+                at = state.q if poses is None else poses
+                contacts = detector(at, *place, self._pressing(fingertip_force))
             else:
                 contacts = detector(state.q, *place)
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
-        return following(contacts, self.contacts, state) if torch.is_grad_enabled() else contacts
+        if not torch.is_grad_enabled():
+            return contacts
+        return following(contacts, lambda at: self.contacts(at, fingertip_force), state)
+
+    def _pressing(self, fingertip_force: Tensor | None) -> tuple[str, ...]:
+        """Pads that measure a force."""
+        if fingertip_force is None or fingertip_force.shape != (len(self.hand.pads),):
+            return ()
+        pads = zip(self.hand.pads, fingertip_force.tolist(), strict=True)
+        return tuple(pad.name for pad, force in pads if force > NOISE.pressing)
 
     @torch.no_grad()
-    def touching(self, state: GraspState) -> ContactSet:
+    def touching(
+        self, state: GraspState, fingertip_force: Float[Tensor, " n_pads"] | None = None
+    ) -> ContactSet:
         """:meth:`contacts`, and links without a pad within 0.2 mm of the object, by the links' names.
 
         Raises:
             NoContactError: nothing touches the object.
         """
-        contacts = self.contacts(state)
+        contacts = self.contacts(state, fingertip_force)
         if not isinstance(self.detector, ContactDetector):
             return contacts
         margin = max(self.detector.margin, TOUCHING)
-        near = self.detector.near(state.q, state.position, state.rotation, margin)
+        pressing = self._pressing(fingertip_force)
+        near = self.detector.near(state.q, state.position, state.rotation, margin, pressing)
         pads = len(contacts.finger)  # they come first, in the same order
         links = [i for i in range(pads, near.n_c) if float(near.gap[i]) < TOUCHING]
         return near.select([*range(pads), *links])
@@ -214,7 +236,8 @@ class KinematicModel(nn.Module):
             GraspError: what :meth:`linearize` raises.
         """
         known = {"fingertip_force": fingertip_force, "expected": expected}
-        start = self.linearize(state, self.touching(state), **known, on_unstable="flag")
+        touching = self.touching(state, fingertip_force)
+        start = self.linearize(state, touching, **known, on_unstable="flag")
         return ContactMotion(self, start, a=a).move(delta_a)
 
     def moving(self, contacts: ContactSet) -> Bool[Tensor, " n_q"]:
@@ -284,7 +307,7 @@ class KinematicModel(nn.Module):
         check_state(self.hand, state, contacts, self.weight.dtype)
         poses = self.kinematics(state.q)
         detected = contacts is None and isinstance(self.detector, ContactDetector)
-        contacts = self._detect(state, poses) if contacts is None else contacts
+        contacts = self._detect(state, poses, fingertip_force) if contacts is None else contacts
         check_contacts(state, contacts, self.link_names, self.options.max_overlap, detected)
         # the same equations, for one state without a derivative in numpy
         plain = state.q.dim() == 1 and not torch.is_grad_enabled() and is_plain(state.q, contacts.gap)
