@@ -149,7 +149,7 @@ def test_a_planar_hand_reaches_as_far_as_its_plane_lets_it() -> None:
 
 @pytest.mark.parametrize("off", ["pad", "object"])
 def test_a_pad_or_an_object_that_is_described_wrongly_by_millimetres_is_turned(off: str) -> None:
-    """The index pad is 3 mm thicker than described, or the object 15 % larger: nothing touches by the model."""
+    """The index pad is 3 mm thicker than described, or the object 15 % larger: nothing touches by f."""
     scale = 1.15 if off == "object" else 1.0
     parameters = preset("nominal").replace(object_scale=scale)
     plant = SimulatedHand("icub_right", "can", engine="mujoco", parameters=parameters)
