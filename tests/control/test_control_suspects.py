@@ -19,6 +19,7 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
+from torch_ekm.control.safety.fingertips import FingertipWatch
 from torch_ekm.control.safety.watch import Watch
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.plant import Observation
@@ -103,3 +104,13 @@ def test_readings_without_a_date_are_told_once(held) -> None:
     assert done.reason is Reason.REACHED
     told = [k for k, step in enumerate(done.steps) if "Observation.time" in step.note]
     assert told == [0]
+
+
+@pytest.mark.parametrize(("by_joints", "told"), [(0.4, False), (1.5, True), (3.0, False), (9.0, True)])
+def test_joints_that_say_nothing_of_forces_do_not_contradict_the_fingertips(
+    held, monkeypatch: pytest.MonkeyPatch, by_joints: float, told: bool
+) -> None:
+    """Joints without springs behind rigid motors give next to nothing, whatever the pads press with."""
+    watch = FingertipWatch(Guards(), held[2])
+    monkeypatch.setattr(watch, "_by_joints", lambda seen: {0: by_joints, 1: by_joints})
+    assert bool(watch._scale(held[0], torch.full((5,), 4.0, dtype=torch.float64))) is told

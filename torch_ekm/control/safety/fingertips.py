@@ -22,6 +22,7 @@ _PRESSED = 3.0  # [N] by the model: a pad that reads nothing then is dead
 _SURPRISE = 3.0  # [N] above the model: joints and springs are asked
 _JOINT_STD = 0.75  # [N] of a normal force by joints and springs alone
 _SCALE = 1.75  # between all fingertips and joints and springs: used hands come to 1.5
+_NOTHING = 5.0  # so many times more: joints without springs behind rigid motors say nothing of forces
 _JOINT_SHARE = 0.25  # and as a share of it: springs are not as described
 
 
@@ -120,7 +121,8 @@ class FingertipWatch:
         """All fingertips together read much more or less than joints and springs give."""
         alone = {i: other for i, other in self._by_joints(seen).items() if force[i] > self.least}
         measured, other = float(force[list(alone)].sum()), sum(alone.values())
-        if len(alone) < 2 or measured / _SCALE < other < measured * _SCALE:
+        plain = measured / _SCALE < other < measured * _SCALE or other < measured / _NOTHING
+        if len(alone) < 2 or plain:
             return []
         return [
             f"the fingertips read {measured:.1f} N, joints and springs give {other:.1f} N ({_SCALE:g} times "
