@@ -44,8 +44,8 @@ def more(field: str, place: int, size: float) -> Fault:
     return change
 
 
-OFF = {  # 5 mm, 17 deg: less than what is called a jump
-    "pose": (more("position", 0, 0.005), "the object went along x", "fingertips press (thumb)"),
+OFF = {  # 8 mm, 17 deg: less than what is called a jump
+    "pose": (more("position", 0, 0.008), "the object went along x", "fingertips press (thumb)"),
     "joint": (more("q", 6, -17 * DEG), "joint 'index_2' turned", "fingertips press (index)"),
 }  # fmt: skip
 
