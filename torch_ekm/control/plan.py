@@ -263,12 +263,17 @@ class WholeTurn:
         if decision.status is not StopReason.RUNNING:
             return decision
         lin = decision.pieces[0].linearization
-        holds = not (modelled and lin.forces.solved) or float(lin.forces.relative_margin.min()) > _HOLDS
-        holds &= decision.grip is None or float(decision.grip.force.min()) > self.force
+        least = math.inf if decision.grip is None else float(decision.grip.force.min())
         after = controller.focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
-        if after > self.off_rotation or not holds:
-            return controller.none(StopReason.GIVEN_UP, against, decision.desired)
-        return decision
+        if modelled and lin.forces.solved and float(lin.forces.relative_margin.min()) <= _HOLDS:
+            why = against or "a finger is at its friction limit"
+        elif least <= self.force:
+            why = against or f"a finger keeps {least:.1f} N"
+        elif after > self.off_rotation:
+            why = against or f"the object is {after / _DEG:.1f} deg off the axis"
+        else:
+            return decision
+        return controller.none(StopReason.GIVEN_UP, why, decision.desired)
 
 
 def _joined(
