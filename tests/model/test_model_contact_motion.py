@@ -234,6 +234,28 @@ def test_forces_keep_the_scale_of_the_description(held) -> None:
     assert found.normal == pytest.approx(described.normal, rel=1e-6)
 
 
+def test_forces_answer_by_the_figures_that_are_known(held, exact) -> None:
+    """Moment arms of the fingers a third larger, half the thumb's: against differences of motions."""
+    model, start, _, _ = held
+    figures = HandFigures.of(model.hand)
+    arms = [name.startswith("moment arm") for name in figures.names]
+    grow = torch.tensor([-0.5 if "thumb" in name else 0.3 for name in figures.names], dtype=torch.float64)
+    figures.mean[arms] = (grow / torch.from_numpy(figures._prior_std))[arms]
+    model = model.with_figures(figures)
+    lin = model.linearize(start.state, start.contacts, forces=start.forces)
+    found = ContactMotion(model, lin).answered(lin)
+    assert found.described_normal_sensitivity is found.normal_force_sensitivity
+    off = (found.normal_force_sensitivity - lin.normal_force_sensitivity).abs().max()
+    assert float(off) > 0.1 * float(lin.normal_force_sensitivity.abs().max())
+    h = 1e-5
+    for i in range(model.hand.n_a):
+        w = torch.zeros(model.hand.n_a, dtype=torch.float64)
+        w[i] = h
+        ends = [ContactMotion(model, lin).move(sign * w).normal for sign in (1, -1)]
+        slope = [(ends[0][name] - ends[1][name]) / (2 * h) for name in lin.contacts.finger]
+        assert found.normal_force_sensitivity[:, i].tolist() == pytest.approx(slope, abs=0.02, rel=0.02)
+
+
 @pytest.mark.parametrize("toy", ["planar", "soft"])
 def test_toys_move_as_their_jacobian_says(toy: str) -> None:
     """In a plane, with a detector of one's own; and with fingers that resist spin."""

@@ -14,7 +14,7 @@ from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, SolverError
 from ..kinematics import GraspState
-from ..model import KinematicModel, ModelStatus
+from ..model import ContactMotion, KinematicModel, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, Piece, StopReason, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
@@ -170,9 +170,11 @@ class LookAndMoveController:
         lin = self.kinematic.linearize(
             state, fingertip_force=fingertip_force, expected=expected, previous=last
         )
-        if lin.forces.solved:
-            self.previous = lin, a
-        return self.corrected(lin)
+        if not lin.forces.solved:
+            return self.corrected(lin)
+        self.previous = lin, a
+        answered = lin if self.forces is None else ContactMotion(self.kinematic, lin).answered(lin)
+        return self.corrected(answered)
 
     def corrected(self, lin: Linearization) -> Linearization:
         """With what was learned of how the pads' forces answer."""

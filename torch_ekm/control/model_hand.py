@@ -124,7 +124,8 @@ class ModelHand:
             lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
             if not lin.forces.solved:
                 self.failure = GraspEndsError(str(lin.doubts[0]))
-            self._motion, self._linearization = ContactMotion(self.kinematic, lin), lin
+            self._motion = ContactMotion(self.kinematic, lin)
+            self._linearization = self._motion.answered(lin)
             self._bears = self._of_pads(
                 dict(zip(lin.contacts.finger, lin.forces.normal.tolist(), strict=True))
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from enum import Enum
@@ -12,7 +13,7 @@ import torch
 
 from ..._arrays import in_torch, of_fields
 from ...contact.detector import ContactDetector
-from ...exceptions import GraspEndsError, NoContactError
+from ...exceptions import GraspEndsError, GraspError, NoContactError
 from ...kinematics.grasp_state import GraspState
 from ...kinematics.se3 import exp
 from ...typing import Array, Float, Tensor
@@ -246,6 +247,21 @@ class ContactMotion:
             actuator=laws.actuator_response(rates, n_c),
             stop=laws.stop_torque(program, done.answer),
         )
+
+    def answered(self, lin: Linearization) -> Linearization:
+        """A linearization of this state with ``df_n/da`` by the figures that are known, as motions have them:
+        alone it has the description's."""
+        if lin.described is None:
+            return lin
+        try:
+            mine = self.linearize(torch.zeros(self.model.hand.n_a, dtype=lin.forces.normal.dtype))
+        except GraspError:
+            return lin
+        normal, rows = lin.normal_force_sensitivity.clone(), mine.contacts.finger
+        for i, name in enumerate(lin.contacts.finger):
+            if name in rows:
+                normal[i] = mine.normal_force_sensitivity[rows.index(name)]
+        return dataclasses.replace(lin.with_normal_sensitivity(normal), described_normal=None)
 
     def shift(self, increment: Float[Tensor, " n_s"]) -> None:
         """Go on from ``s (+) increment`` [rad, m, rad] as from a reading: the forces are those of now, which
