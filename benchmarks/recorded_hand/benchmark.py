@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+import torch_ekm
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.experiments.jobs import run_jobs
@@ -19,7 +22,6 @@ from torch_ekm.typing import Array
 
 from .adapting import adapting_predictions
 from .finger_markers import FingerMarkers
-from .fingerprint import fingerprint
 from .fingers import identify_markers
 from .learning import learned_predictions
 from .nominal import (
@@ -33,17 +35,15 @@ from .nominal import (
     through_play,
 )
 from .recordings import APART, RecordedPath, known_diameter, read_recordings
-from .scores import Row, score
+from .scores import SUBSETS, Row, score
 from .states import States, estimate_states
 from .synthetic import OBJECTS, write_synthetic
 
 HAND = "yale_t42"
 HORIZONS = (10, 50)
 """[steps of 0.1 s] at which learners are scored, too."""
-CURVE = (10, 20, 30, 50, 100)
-"""Horizons of the picture of the models alone."""
 LEARNER = "SOGP mixture"
-SUBSETS = ("all", "first", "first, smooth", "changed")
+_LEARNED = [nominal for nominal in NOMINALS if nominal.kind in ("none", "calibrated", "online")]
 
 Predicted = dict[str, Array]
 
@@ -114,7 +114,17 @@ def predict_recorded_hand(
             raise UnknownNameError("learner", name, LEARNERS)
     with TemporaryDirectory() as temporary:
         paths = _chosen(data, temporary, quick)
-        return _run(paths, tuple(learners), Path(folder or temporary), processes, quick, on_done)
+        cache = Path(folder or temporary) / _digest(paths, quick)
+        return _run(paths, tuple(learners), cache, processes, quick, on_done)
+
+
+def _digest(paths: dict[str, list[RecordedPath]], quick: bool) -> str:
+    """Ten letters that change with the recordings and the version of the package."""
+    found = hashlib.sha256(f"{torch_ekm.__version__} {quick} {list(paths)}".encode())
+    for path in itertools.chain.from_iterable(paths.values()):
+        for values in vars(path).values():
+            found.update(values.tobytes())
+    return found.hexdigest()[:10]
 
 
 def count_jobs(data: str | Path | None, learners: int, *, quick: bool = False) -> int:
@@ -124,7 +134,7 @@ def count_jobs(data: str | Path | None, learners: int, *, quick: bool = False) -
         DescriptionError: as :func:`predict_recorded_hand`.
     """
     paths = OBJECTS if data is None else _chosen(data, "", quick)
-    return len(paths) + 1 + len({*HORIZONS, *CURVE}) + learners * len(NOMINALS) * len(HORIZONS)
+    return len(paths) + 1 + len(HORIZONS) + learners * len(_LEARNED) * len(HORIZONS)
 
 
 def _chosen(data: str | Path | None, temporary: str, quick: bool) -> dict[str, list[RecordedPath]]:
@@ -171,8 +181,7 @@ def _run(
     }
     samples = {
         horizon: {name: take_samples(own, states[name], moved[name], horizon) for name, own in paths.items()}
-        for horizon in sorted({*HORIZONS, *CURVE})
-        if all(max(map(len, own)) > horizon for own in paths.values())
+        for horizon in HORIZONS
     }
     alone = {
         (nominal.name, horizon): predictions(nominal, taken, by_state, APART)
@@ -186,7 +195,7 @@ def _run(
     for (name, horizon), own in predicted.items():
         taken = {key: samples[horizon][key] for key in reported}
         unit = samples[horizon][APART].motion.std(axis=0)
-        for subset in SUBSETS if horizon in HORIZONS else SUBSETS[:1]:
+        for subset in SUBSETS:
             rows.append(score(name, horizon, subset, taken, own, unit))
     return RecordedHandResult(paths, states, samples, predicted, rows, markers, found, quick)
 
@@ -235,7 +244,7 @@ def _with_learners(
     order = sorted(name for name in states if name != APART)
     jobs, keys = {}, {}
     for horizon in sorted(HORIZONS, reverse=True):  # few samples first
-        for nominal in NOMINALS:
+        for nominal in _LEARNED:
             for learner in learners:
                 key = f"{nominal.name} + {learner}"
                 job = f"{key} {horizon}"
@@ -301,19 +310,11 @@ def _cached(
     processes: int,
     on_done: Callable[[str], None] | None,
 ) -> dict[str, Any]:
-    """:func:`run_jobs`, each job's file named after what decides its result."""
+    """:func:`run_jobs`, in the folder of these recordings."""
     files = {}
-    digests: dict[int, str] = {}  # most arguments are those of all jobs
-
-    def digest(value: object) -> str:
-        if id(value) not in digests:
-            digests[id(value)] = fingerprint(value)
-        return digests[id(value)]
-
-    for name, arguments in jobs.items():
+    for name in jobs:
         plain = "".join(c if c.isalnum() else "_" for c in name)
-        decides = fingerprint(*map(digest, (function, *arguments)))
-        files[f"{kind}_{plain}_{decides[:10]}"] = name
+        files[f"{kind}_{plain}"] = name
     named = {file: jobs[name] for file, name in files.items()}
     results = run_jobs(function, named, cache, processes, on_done)
     return {files[file]: result for file, result in results.items()}

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import pytest
 pytest.importorskip("write_pages", reason="the benchmarks are not part of this installation")
 
 import write_pages
-from bars import Target, targets_table
 from dots import dot_chart
 from page import Section, page_text
 
@@ -87,7 +84,7 @@ def test_half_a_result_of_another_commit_is_not_gone_on_with(
 def test_an_unknown_page_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         write_pages.main(["nothing"])
-    assert "no page nothing; there are demo" in capsys.readouterr().err
+    assert "no page nothing; there are paper" in capsys.readouterr().err
 
 
 def test_a_report_comes_with_its_headings_below_the_pages(
@@ -169,16 +166,6 @@ def test_tables_are_drawn_with_their_intervals(tmp_path: Path) -> None:
     assert single.lines[0].get_color() != km  # ours, in bold
 
 
-def test_targets_say_by_how_much_they_are_missed() -> None:
-    assert Target("x", 20.0, most=25).missed_by == 0
-    assert Target("x", 30.0, most=25).missed_by == 5
-    assert Target("x", 80.0, least=90).missed_by == 10
-    assert Target("x", 0.5, least=1, most=3).missed_by == 0.5
-    table = targets_table([Target("a", 20.0, most=25), Target("b", 30.0, most=25), Target("c", 1.0, least=2)])
-    assert table.header == ["figure", "measured", "bar", "missed by"]
-    assert table.text() == [["b", "30", "25", "5"], ["c", "1", "2", "1"]]  # what is met is not listed
-
-
 def test_no_page_says_that_a_bar_is_met() -> None:
     pages = [*(write_pages.HERE.parent / "docs").rglob("*.md"), write_pages.HERE.parent / "README.md"]
     assert not [page.name for page in pages if re.search(r"\|\s*met\s*\|", page.read_text("utf-8"))]
@@ -191,19 +178,3 @@ SCRIPTS = [path for path in write_pages.HERE.glob("**/*.py") if path.parent.name
 def test_every_script_can_be_imported(script: Path) -> None:
     """What nobody runs in a test still follows the package's names."""
     importlib.import_module(script.stem)
-
-
-@pytest.mark.parametrize(
-    "script",
-    sorted(
-        path for path in SCRIPTS if path.parent.name == "studies" and "__main__" in path.read_text("utf-8")
-    ),
-    ids=lambda path: path.stem,
-)
-def test_studies_start_from_the_command_line(script: Path) -> None:
-    """Where their own folder alone is on the path, and not those that the tests add."""
-    environment = {**os.environ, "PYTHONPATH": str(write_pages.ROOT)}
-    done = subprocess.run(
-        [sys.executable, str(script), "--help"], capture_output=True, text=True, env=environment, check=False
-    )
-    assert done.returncode == 0, done.stderr

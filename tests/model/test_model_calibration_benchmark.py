@@ -1,4 +1,4 @@
-"""A small form of benchmarks/kinematic_model/calibration.py: a simulated hand whose every figure is off."""
+"""A simulated hand whose every figure is off is calibrated from its motions."""
 
 from __future__ import annotations
 

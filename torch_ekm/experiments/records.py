@@ -30,8 +30,7 @@ class Trial:
     object: str
     """Its name, or the stem of its file."""
     kind: str
-    """"turn", "warm-up", "first" (learning the hand), "new object", "long step" (one motion without feedback)
-    or "camera off" (at the end)."""
+    """"turn", or "warm-up", "first", "learning": those in which a learner or the hand is learned."""
     controller: str
     seed: int
     trial: int

@@ -23,8 +23,8 @@ from .generalize import Generalize
 
 @dataclass(frozen=True)
 class Demo(Generalize):
-    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, without the probes
-    and with pictures.
+    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and
+    with pictures.
 
     Raises:
         UnknownNameError: no such object; the message lists them.
@@ -34,11 +34,8 @@ class Demo(Generalize):
 
     objects: tuple[str, ...] = ("box",)
     warm_up: int = 0
-    long_step_deg: float = 0.0
-    blind_deg: float = 0.0
     controllers: tuple[str, ...] = ("KM", "E-KM")
     poses: bool = True
-    new_objects: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

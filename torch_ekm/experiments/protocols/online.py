@@ -50,6 +50,7 @@ class Online(Protocol):
     """In these trials the object is knocked after its third motion."""
     tendons_replaced: int = 31
     """Before this trial the tendons are replaced (0: never)."""
+    controllers: tuple[str, ...] = CONTROLLERS
 
     def __post_init__(self) -> None:
         low, high = self.angle_range_deg
@@ -74,8 +75,9 @@ class Online(Protocol):
 
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, int]]:
         """One for each seed and controller: all trials in order."""
-        stem = f"online_{digest(self.setting, (self.object,), self)}"
-        return {f"{stem}_{name}_{seed}": (name, seed) for seed in seeds for name in CONTROLLERS}
+        alone = dataclasses.replace(self, controllers=CONTROLLERS)  # a job does not depend on the others
+        stem = f"online_{digest(self.setting, (self.object,), alone)}"
+        return {f"{stem}_{name}_{seed}": (name, seed) for seed in seeds for name in self.controllers}
 
     def session(self, controller: str, seed: int) -> list[Record]:
         """All trials of one seed, in order."""
