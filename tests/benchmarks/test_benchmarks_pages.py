@@ -113,25 +113,30 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     assert sys.executable not in text
 
 
-def test_results_come_first_and_long_tables_are_folded() -> None:
+def test_results_come_first_and_long_tables_are_files() -> None:
     def table(rows: int) -> str:
         return "\n".join(["| a |", "|---|", *(f"| {k} |" for k in range(rows))])
 
     picture = "![Seen.](a.svg)\n\n*Seen.*"
-    legend = "- **KM**: the model"
-    body = f"Answer.\n\n{legend}\n\n{picture}\n\n### Short\n\n{table(10)}\n\nNote.\n\n### Other\n\n{table(2)}"
-    text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["Written by it."])
-    folded = f"<details>\n<summary>Other</summary>\n\n{table(2)}\n\n</details>"
-    shown = ["Answer.", picture, f"### Short\n\n{table(10)}\n\nNote.", "See.", legend, folded]
-    made = "## Commands and versions\n\n- Part: `run`: commit 1.\n\nWritten by it."
-    assert text == "\n\n".join(["# Page\n\n## Part", *shown, made])
-    long = page_text("Page", [Section("Part", "See.", body.replace(table(10), table(11)), "")], [])
-    assert f"<summary>Short</summary>\n\n{table(11)}" in long
-    bare = page_text("Page", [Section("Part", "See.", table(16), "")], [])  # no picture shows what is in it
-    assert "<details>" not in bare
-    assert "<summary>Table of 17 rows</summary>" in page_text(
-        "Page", [Section("P", "See.", table(17), "")], []
+    body = f"Answer.\n\n{picture}\n\n### Short\n\n{table(8)}\n\nNote.\n\n### Other\n\n{table(2)}\n\nIts note."
+    files: dict[str, list[list[str]]] = {}
+    text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["By it."], "one", files)
+    shown = [
+        "Answer.",
+        picture,
+        "See.",
+        f"### Short\n\n{table(8)}\n\nNote.",
+        "Tables: [Other](one/other.csv).",
+    ]
+    made = "## Commands and versions\n\n- Part: `run`: commit 1.\n\nBy it."
+    assert sorted(text.split("\n\n")) == sorted(
+        "\n\n".join(["# Page\n\n## Part", *shown, made]).split("\n\n")
     )
+    assert files == {"other.csv": [["a"], ["0"], ["1"]]}
+    long = page_text("Page", [Section("Part", "See.", table(9), "")] * 2, [], "one", files)
+    assert "Tables: [Part](one/part.csv).\n" in long
+    assert "Tables: [Part](one/part_2.csv).\n" in long
+    assert len(files["part.csv"]) == 10
 
 
 TABLES = """Answer.
