@@ -166,7 +166,7 @@ def frame_of(
     """
     rows = [(job, one) for job, session in results.items() for one in session]
     records = {str(k): [TrialRecord.from_json(one["record"])] for k, (_, one) in enumerate(rows)}
-    trials = trial_frame(records, Setting().safety.rule.max_steps)
+    trials = trial_frame(records)
     more = pandas.DataFrame([{k: v for k, v in one.items() if k != "record"} for _, one in rows])
     plant, contender = zip(*(keys[job] for job, _ in rows), strict=True)
     found = pandas.concat([trials, more, pandas.DataFrame({"plant": plant, "contender": contender})], axis=1)

@@ -111,6 +111,7 @@ def reproduce(
         **protocol.setting.figures(),
     }
     report.write(folder)
+    trials.to_csv(folder / "trials.csv", index=False)
     return report
 
 
@@ -125,7 +126,7 @@ def run_trials(
     kept = run_jobs(protocol.run, protocol.jobs(seeds), folder, processes, on_done)
     read = TrialRecord.from_json
     results = {name: [read(figures) for figures in session] for name, session in kept.items()}
-    return trial_frame(results, protocol.setting.safety.rule.max_steps)
+    return trial_frame(results)
 
 
 def objects_of(names: str | Path) -> tuple[str, ...]:

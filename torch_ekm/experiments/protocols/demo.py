@@ -55,7 +55,7 @@ class Demo(Generalize):
         report, turns = super().report(seeds, trials, folder), select(trials)
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
-        shown = ("stop_reasons", "controllers", "motions", "comparison", "prediction")
+        shown = ("stop_reasons", "controllers", "prediction")
         report.tables = [self.angle_table(turns)] + [t for t in report.tables if t.name in shown]
         report.leading = 1
         report.figures = [*self._pictures(turns, folder), *self._motions(turns, folder), *report.figures]

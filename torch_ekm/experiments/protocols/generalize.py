@@ -130,13 +130,10 @@ class Generalize(Protocol):
         shown = [
             paper_table(trials),
             significance,
-            cell_table(trials),
             tables.reason_table(trials),
             object_table(trials),
             ends_table(trials),
             tables.controller_table(trials),
-            tables.motion_table(trials),
-            tables.comparison_table(trials),
             tables.prediction_table(trials),
         ]
         shown = [table for table in shown if table.rows]
@@ -177,20 +174,6 @@ def cell_errors(trials: DataFrame) -> tuple[DataFrame, DataFrame]:
         for name in ("E-KM", "KM")
     )
     return ekm.align(km, join="inner")
-
-
-def cell_table(trials: DataFrame) -> Table:
-    """Error of KM and E-KM for each object and target (the paper's Fig. 6)."""
-    rows: dict[str, list[Cell]] = {}
-    for (cell, ekm), (_, km) in zip(*(errors.iterrows() for errors in cell_errors(trials)), strict=True):
-        won = f"{(ekm < km).sum()} of {(ekm - km).count()}"
-        text = f"{cell[2]:g}: {km.mean():.2f}, {ekm.mean():.2f}, {won}"
-        rows.setdefault(cell[0], [cell[0]]).append(text)
-    most = max(map(len, rows.values()), default=1)
-    filled = [row + [None] * (most - len(row)) for row in rows.values()]
-    columns = ["object", *(f"trial {k}" for k in range(1, most))]
-    note = "Target [deg]: mean errors of KM and E-KM [deg], hands on which the E-KM ends nearer."
-    return Table("cells", "Each object and target (the paper's Fig. 6)", columns, filled, note)
 
 
 def significance_table(trials: DataFrame) -> Table:

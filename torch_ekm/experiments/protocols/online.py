@@ -120,8 +120,6 @@ class Online(Protocol):
             self.learning_table(trials),
             tables.prediction_table(trials),
             tables.controller_table(trials),
-            tables.motion_table(trials),
-            tables.comparison_table(trials),
         ]
         what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."
         if len(seeds) >= LEAST_SEEDS:
