@@ -1,4 +1,4 @@
-"""What came of a trial: typed figures, kept as JSON."""
+"""Records of trials: typed figures, kept as JSON."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOVING = 0.5 * _DEG  # commands that ask for less say nothing about the shortfa
 
 @dataclass(frozen=True)
 class Trial:
-    """What was to be done: object, controller, grasp and rotation."""
+    """A trial says what was to be done: object, controller, grasp and rotation."""
 
     object: str
     """Its name, or the stem of its file."""

@@ -72,7 +72,7 @@ class Bench:
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
         adapts = self.learns and setting.follows
         self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse, adapts=adapts)
-        """Of the hand; it stays when the object changes."""
+        """It is that of the hand, and stays when the object changes."""
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model)
         self.learner: ResidualLearner | None = None
         self.encoding: GraspEncoding | None = None
@@ -80,12 +80,12 @@ class Bench:
         self.no_grasp = ""
         """Why the last grasp that failed did."""
         self.last: Manipulation | None = None
-        """Of the last :meth:`turn`."""
+        """The last :meth:`turn` left it."""
         self._ever_held, self._failed = False, 0  # trials without a grasp
 
     @property
     def learns(self) -> bool:
-        """Whether the controller is an E-KM, which trains a learner after each motion."""
+        """The controller is an E-KM, which trains a learner after each motion."""
         return self.controller.startswith("E-KM")
 
     def grasp(self, seed: int, trial: int) -> GraspState | None:

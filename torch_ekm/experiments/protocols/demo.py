@@ -51,7 +51,7 @@ class Demo(Generalize):
         return dataclasses.replace(self, angles_deg=self.angles_of(self.object)[:2])
 
     def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
-        """That of the turns, each target on its own, the motions, and pictures."""
+        """Report the turns, each target on its own, the motions, and pictures."""
         report, turns = super().report(seeds, trials, folder), select(trials)
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"

@@ -27,7 +27,7 @@ _LEARNED = 16
 _KNOCK = (0.0, 0.10, 0.0)
 """Torque of a knock [N m], hand frame, for 50 ms: it turns the tube by 5 to 10 deg."""
 _NEW_TENDONS = {"moment_arm": 1.15, "servo_stiffness": 0.8}
-"""What the plant then is: tighter tendons, less stretch."""
+"""The plant then has tighter tendons, and less stretch."""
 
 
 @dataclass(frozen=True)

@@ -44,5 +44,5 @@ class Protocol(ABC):
         """
 
     def run(self, *arguments: Any) -> list[dict[str, Any]]:
-        """What :meth:`session` leaves, in terms that JSON can keep."""
+        """Run :meth:`session`; its records in terms that JSON can keep."""
         return [record.to_json() for record in self.session(*arguments)]

@@ -1,4 +1,4 @@
-"""What the reports of several protocols share: tables of the controllers, and sentences."""
+"""Tables of the controllers and sentences, which the reports of several protocols share."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def by_object(trials: DataFrame) -> dict[str, DataFrame]:
 
 
 def legend(trials: DataFrame) -> dict[str, str]:
-    """What the controllers are that took part."""
+    """Say what the controllers are that took part."""
     there = set(trials["controller"])
     return {name: line for name, line in LEGEND.items() if name in there}
 
@@ -190,7 +190,7 @@ def why(turns: DataFrame) -> str:
 
 
 def warmed_up(turns: int) -> str:
-    """What the E-KM does before it is measured."""
+    """Say what the E-KM does before it is measured."""
     before = f" The E-KM makes {_counted(turns, 'turn')} with each object and seed before those that count."
     return before if turns else ""
 
