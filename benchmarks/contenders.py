@@ -182,8 +182,6 @@ WHOLE_TURNS = {
 PLANS = {
     "as it is": Contender(),
     "1 deviation": _plan(deviations=1.0),
-    "3 deviations": _plan(deviations=3.0),
-    "off the axis by 4 deg": _plan(off_rotation=4 * _DEG),
     "off the axis by 16 deg": _plan(off_rotation=16 * _DEG),
     "no band of forces": _plan(force=-math.inf),
     "no bands": _plan(force=-math.inf, off_rotation=math.inf),
@@ -197,7 +195,6 @@ PARTS = {
     "f as described": Contender("E-KM", {"adapts": False}),
     "no g": Contender("E-KM", {"learner": "model alone"}),
     "g: rbf": Contender("E-KM", {"learner": "rbf"}),
-    "g: MLP": Contender("E-KM", {"learner": "MLP"}),
     "no servo inverse": Contender("E-KM", {"servo_inverse": False}),
     "no robust update": Contender("E-KM", {"learner_options": {"robust": None}}),
     "no rolling": _model(rolling=False),

@@ -262,10 +262,11 @@ def verdict(turns: Frame, by: str) -> str:
     """The last line: what came of each group."""
 
     def told(mine: Frame) -> str:
-        lost, reached, motions = (FIGURES[name].of(mine) for name in ("lost", "reached", "motions"))
-        turning, seconds = (FIGURES[name].of(mine) for name in ("turning movements", "seconds"))
-        counts = f"lost {lost} of {len(mine)}, reached {reached}, turning movements {turning:.1f}"
-        return f"{counts}, all motions {motions:.1f}, seconds {seconds:.1f}"
+        names = ("lost", "reached", "turning movements", "motions", "seconds")
+        lost, reached, *means = (FIGURES[name].of(mine) for name in names)
+        turning, motions, seconds = (Column("", ".1f").text(one) for one in means)
+        counts = f"lost {lost} of {len(mine)}, reached {reached}, turning movements {turning}"
+        return f"{counts}, all motions {motions}, seconds {seconds}"
 
     return "; ".join(f"{name} {told(mine)}" for name, mine in turns.groupby(by, sort=False))
 

@@ -39,7 +39,7 @@ def mean_text(trials: DataFrame | None) -> str:
     """Mean errors of KM and E-KM over the objects, and their ratio: the paper's if there are no trials."""
     if trials is None:
         km, ekm = (float(np.mean([pair[k] for pair in TABLE_II.values()])) for k in (0, 1))
-        return f"{km:.2f}; {ekm:.2f}; {np.mean(list(RATIOS.values())):.0f} %"
+        return f"{km:.2f}; {ekm:.2f}; {100 * ekm / km:.0f} %"
     turns = trials[(trials["kind"] == "turn") & trials["grasped"].astype(bool)]
     errors = turns.groupby("controller")["error_deg"].mean()
     return f"{errors['KM']:.2f}; {errors['E-KM']:.2f}; {100 * errors['E-KM'] / errors['KM']:.0f} %"
@@ -74,7 +74,7 @@ def figures_table(here: Mapping[str, DataFrame], online: Table, prediction: str)
     ]
     note = "Simulated iCub hands, presets nominal and worn. A cell is an object with a target."
     columns = ["in the paper", "paper", "here", "here, worn hand"]
-    return Table("paper", "Number by number", columns, rows, note)
+    return Table("numbers", "Number by number", columns, rows, note)
 
 
 def overview(
