@@ -78,8 +78,8 @@ class Question:
 
 
 @dataclass(frozen=True)
-class Figures:
-    """A figure of some trials."""
+class Measure:
+    """A figure that tables can state of some trials."""
 
     of: Callable[[Frame], Cell]
     spec: str = ".2f"
@@ -119,39 +119,39 @@ def other_ends(turns: Frame) -> str:
 
 
 #: What tables can say of some trials.
-FIGURES: dict[str, Figures] = {
-    "turns": Figures(len),
-    "lost": Figures(lambda t: int(t["lost"].sum())),
-    "reached": Figures(lambda t: len(_reached(t))),
-    "motions": Figures(lambda t: _mean(_reached(t)["motions"]), ".1f"),
-    "turning movements": Figures(lambda t: _mean(_reached(t)["turning"]), ".1f"),
-    "seconds": Figures(lambda t: _mean(_reached(t)["simulated_s"]), ".1f"),
-    "error [deg]": Figures(lambda t: _mean(t["error_deg"])),
-    "off the axis, largest [deg]": Figures(lambda t: float(t["survivor_off_deg"].max()), ".1f"),
-    "first motion [deg]": Figures(lambda t: _mean(t["first_step_deg"])),
-    "KM, first 5 [deg]": Figures(lambda t: _mean(early(t, "km"))),
-    "E-KM, first 5 [deg]": Figures(lambda t: _mean(early(t, "ekm"))),
-    "predicted by the KM [deg]": Figures(lambda t: _mean(t["true_prediction_km"])),
-    "by the E-KM [deg]": Figures(lambda t: _mean(t["true_prediction_ekm"])),
-    "joints off by [deg]": Figures(lambda t: _mean(t["joints"])),
-    "motors off by [deg]": Figures(lambda t: _mean(t["motors"])),
-    "other ends": Figures(other_ends),
-    "declined": Figures(lambda t: int((t["reason"] == "out of reach").sum())),
-    "within": Figures(lambda t: int((t["size"] <= 1).sum())),
-    "turn [deg]": Figures(lambda t: _median(t[t["reason"] != "out of reach"]["wrong_deg"])),
-    "shift [mm]": Figures(lambda t: _median(t[t["reason"] != "out of reach"]["wrong_mm"])),
-    "farthest [deg]": Figures(lambda t: _median(t["largest"]), ".1f"),
-    "predicted end off by [deg]": Figures(lambda t: _median((t["reach"] - t["largest"]).abs()), ".1f"),
-    "estimate off by [deg]": Figures(lambda t: _median(t["estimate"].where(t["part"].str[:5] == "blind"))),
-    "stated sd [deg]": Figures(lambda t: _median(t["sd"])),
-    "along the grip, last [mm]": Figures(lambda t: _mean(_last(t)["shift"])),
-    "contacts slid, last [mm]": Figures(lambda t: _mean(_last(t)["slid"])),
+FIGURES: dict[str, Measure] = {
+    "turns": Measure(len),
+    "lost": Measure(lambda t: int(t["lost"].sum())),
+    "reached": Measure(lambda t: len(_reached(t))),
+    "motions": Measure(lambda t: _mean(_reached(t)["motions"]), ".1f"),
+    "turning movements": Measure(lambda t: _mean(_reached(t)["turning"]), ".1f"),
+    "seconds": Measure(lambda t: _mean(_reached(t)["simulated_s"]), ".1f"),
+    "error [deg]": Measure(lambda t: _mean(t["error_deg"])),
+    "off the axis, largest [deg]": Measure(lambda t: float(t["survivor_off_deg"].max()), ".1f"),
+    "first motion [deg]": Measure(lambda t: _mean(t["first_step_deg"])),
+    "KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "km"))),
+    "E-KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "ekm"))),
+    "predicted by the KM [deg]": Measure(lambda t: _mean(t["true_prediction_km"])),
+    "by the E-KM [deg]": Measure(lambda t: _mean(t["true_prediction_ekm"])),
+    "joints off by [deg]": Measure(lambda t: _mean(t["joints"])),
+    "motors off by [deg]": Measure(lambda t: _mean(t["motors"])),
+    "other ends": Measure(other_ends),
+    "declined": Measure(lambda t: int((t["reason"] == "out of reach").sum())),
+    "within": Measure(lambda t: int((t["size"] <= 1).sum())),
+    "turn [deg]": Measure(lambda t: _median(t[t["reason"] != "out of reach"]["wrong_deg"])),
+    "shift [mm]": Measure(lambda t: _median(t[t["reason"] != "out of reach"]["wrong_mm"])),
+    "farthest [deg]": Measure(lambda t: _median(t["largest"]), ".1f"),
+    "predicted end off by [deg]": Measure(lambda t: _median((t["reach"] - t["largest"]).abs()), ".1f"),
+    "estimate off by [deg]": Measure(lambda t: _median(t["estimate"].where(t["part"].str[:5] == "blind"))),
+    "stated sd [deg]": Measure(lambda t: _median(t["sd"])),
+    "along the grip, last [mm]": Measure(lambda t: _mean(_last(t)["shift"])),
+    "contacts slid, last [mm]": Measure(lambda t: _mean(_last(t)["slid"])),
 }  # fmt: skip
 
 
 def _last(turns: Frame) -> Frame:
     """The last return of each series."""
-    back = turns[(turns["part"] == "series") & (turns["back"] == True)]  # noqa: E712
+    back = turns[(turns["part"] == "series") & turns["back"].eq(True)]
     return back.groupby(["plant", "contender", "object", "seed"]).tail(1)
 
 
