@@ -138,8 +138,8 @@ FIGURES: dict[str, Measure] = {
     "other ends": Measure(other_ends),
     "declined": Measure(lambda t: int((t["reason"] == "out of reach").sum())),
     "within": Measure(lambda t: int((t["size"] <= 1).sum())),
-    "turn [deg]": Measure(lambda t: _median(t[t["reason"] != "out of reach"]["wrong_deg"])),
-    "shift [mm]": Measure(lambda t: _median(t[t["reason"] != "out of reach"]["wrong_mm"])),
+    "turn [deg]": Measure(lambda t: _median(t["wrong_deg"])),
+    "shift [mm]": Measure(lambda t: _median(t["wrong_mm"])),
     "farthest [deg]": Measure(lambda t: _median(t["largest"]), ".1f"),
     "predicted end off by [deg]": Measure(lambda t: _median((t["reach"] - t["largest"]).abs()), ".1f"),
     "estimate off by [deg]": Measure(lambda t: _median(t["estimate"].where(t["part"].str[:5] == "blind"))),
@@ -170,6 +170,8 @@ def frame_of(
     more = pandas.DataFrame([{k: v for k, v in one.items() if k != "record"} for _, one in rows])
     plant, contender = zip(*(keys[job] for job, _ in rows), strict=True)
     found = pandas.concat([trials, more, pandas.DataFrame({"plant": plant, "contender": contender})], axis=1)
+    if "part" in found:
+        found["case"] = found["contender"] + ", " + found["part"]
     return found[found["grasped"].astype(bool)].reset_index(drop=True)
 
 

@@ -156,7 +156,7 @@ SENSING = Question(
     READINGS,
     options=BY_HAND,
     columns=(
-        "turns", "lost", "reached", "motions", "error [deg]", "by the E-KM [deg]", "joints off by [deg]",
+        "turns", "lost", "reached", "error [deg]", "by the E-KM [deg]", "joints off by [deg]",
         "motors off by [deg]",
     ),
     split="object",

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from torch_ekm.control import Direction, FocusedPose, Manipulation, PoseTarget
+from torch_ekm.control import Direction, FocusedPose, Manipulation, PoseTarget, StopReason
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import NotGrasped, Record, Trial, TrialRecord, true_state
@@ -160,7 +161,8 @@ def there_and_back(
         states = true_state(before), true_state(bench.last.stop.final)
         shift = {name: 1e3 * float(axes[name] @ (states[1].position - states[0].position)) for name in "abc"}
         slid = 0.0 if record.lost else _slid(bench, *states)
-        made.append(row(record, part="series", back=back, shift=shift["b"], slid=slid))
+        counted = replace(record, angle_deg=angle)  # a lost object counts with the whole turn
+        made.append(row(counted, part="series", back=back, shift=shift["b"], slid=slid))
         if record.lost:
             break
     for k in range(1, 1 + min(times, 5)):
@@ -233,12 +235,14 @@ def directions(
     *,
     learns_by: Sequence[float],
     groups: Sequence[str],
-    asked: dict[str, float],
+    within: dict[str, float],
+    stricter: float,
 ) -> list[Row]:
     """Every target from a grasp of its own; what the model finds out of reach is declined.
 
     Args:
-        asked: tolerances of the loop, by unit.
+        within: true errors that are called near, by unit; ``size`` of a trial is in these.
+        stricter: share of them that the loop asks of its noisy readings.
     """
     bench, made = _warmed(make, items[0], seed, learns_by), []
     every = [(group, parts) for group in groups for parts in TARGETS[group]]
@@ -247,7 +251,9 @@ def directions(
         if start is None:
             continue
         axes = axes_of(bench)
-        focus = FocusedPose([Direction(axes[axis], unit, tolerance=asked[unit]) for unit, axis, _ in parts])
+        focus = FocusedPose(
+            [Direction(axes[axis], unit, tolerance=stricter * within[unit]) for unit, axis, _ in parts]
+        )
         target = target_of(start, parts, axes)
         done = bench.closed_loop(bench.plant, focus, decline=True).run(target)
         wrong = (focus.matrix @ target.error(true_state(done.stop.final))).abs().tolist()
@@ -256,7 +262,11 @@ def directions(
             errors[unit] = max(errors.get(unit, 0.0), error / _SI[unit])
         about = Trial(bench.name, "turn", bench.controller, seed, k, max(part.size for part in parts))
         record = TrialRecord.of(about, done, bench.hand.rotation_axis, learns=bench.learns)
-        made.append(row(record, group=group, wrong_deg=errors.get("deg"), wrong_mm=errors.get("mm")))
+        figures = {"wrong_deg": errors.get("deg"), "wrong_mm": errors.get("mm")}
+        size = max(error / within[unit] for unit, error in errors.items())
+        if done.reason is StopReason.OUT_OF_REACH:  # declined: nothing was tried
+            figures, size = dict.fromkeys(figures), math.inf
+        made.append(row(record, group=group, size=size, **figures))
     bench.close()
     return made
 

@@ -196,9 +196,19 @@ def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.Monkey
 def test_foresight_says_what_was_predicted_and_what_came(tmp_path: Path) -> None:
     words = ["--quick", "--engine", "mujoco", "--jobs", "1", "--contenders", "E-KM", "--out", str(tmp_path)]
     made = matrix.ask("foresight", QUESTIONS["foresight"], words)
-    parts = {text[0]: text for text in made.tables[-1].text()}
-    assert list(parts) == ["blind, by touch", "blind, prediction alone", "as far as it goes"]
-    assert float(parts["as far as it goes"][4]) == pytest.approx(6.0, abs=1.5)
+    parts = {text[0]: text for text in made.tables[0].text()}
+    assert list(parts) == [
+        "E-KM, blind, by touch", "E-KM, blind, prediction alone", "E-KM, as far as it goes"
+    ]  # fmt: skip
+    assert float(parts["E-KM, as far as it goes"][4]) == pytest.approx(6.0, abs=1.5)
     sd = [float(parts[name][7]) for name in list(parts)[:2]]
     assert 0.05 < sd[0] < sd[1]
     assert math.isfinite(float(np.sum(sd)))
+
+
+def test_tables_fit_on_a_page() -> None:
+    """At most eight columns, and eight rows of contenders."""
+    for name, asked in {**QUESTIONS, "sensing": SENSING}.items():
+        assert len(asked.columns) <= 7, name
+        assert not set(asked.columns) - set(FIGURES), name
+        assert len(asked.contenders) <= 8, name

@@ -48,8 +48,8 @@ def test_a_quick_run_prints_its_verdict(tmp_path: Path, monkeypatch, capsys) -> 
     rows = {
         line.split(" | ")[0][2:]: line.split(" | ")[1:] for line in told.splitlines() if line.startswith("| ")
     }
-    assert 0.05 < float(rows["all sensed"][6]) < 2.0  # [deg] of joints
-    assert float(rows["true joint angles"][6]) == 0.0
-    assert 0.01 < float(rows["all sensed"][7].rstrip(" |")) < 3.0  # [deg] of motors
+    assert 0.05 < float(rows["all sensed"][5]) < 2.0  # [deg] of joints
+    assert float(rows["true joint angles"][5]) == 0.0
+    assert 0.01 < float(rows["all sensed"][6].rstrip(" |")) < 3.0  # [deg] of motors
     assert 0.1 < float(rows["index_1"][0]) < 1.0  # [deg] Hall fit
     assert float(rows["exact"][1]) <= float(rows["20 pictures"][1]) < float(rows["not calibrated"][1])
