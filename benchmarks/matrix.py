@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas
 from contenders import Contender
-from hands import Hand, hands
+from hands import CONDITIONS, Hand, hands
 
 from torch_ekm._terminal import progress
 from torch_ekm.cli._app import parse_seeds
@@ -320,6 +320,11 @@ def report(asked: Question, turns: Frame, folder: Path, name: str) -> Report:
     return made
 
 
+def _split(names: str, known: Mapping[str, Any]) -> list[str]:
+    """Names separated by semicolons, or by commas where none of them has any."""
+    return [names] if names in known else names.split(";" if ";" in names else ",")
+
+
 def ask(
     name: str, asked: Question, arguments: Sequence[str] | None = None, about: str | None = __doc__
 ) -> Report:
@@ -331,20 +336,16 @@ def ask(
     parser.add_argument(
         "--hands", default=asked.hands, help="see hands.py; also all, strong, losing, conditions"
     )
-    parser.add_argument("--contenders", help=f"some of {', '.join(asked.contenders)}")
+    parser.add_argument("--contenders", help=f"some of {'; '.join(asked.contenders)}")
     parser.add_argument("--engine", default=asked.engine, choices=ENGINES)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
     parser.add_argument("--out", type=Path, default=Path(f"{name}_output"), help="keeps what is finished")
     parser.add_argument("--quick", action="store_true", help="one hand, object and seed, two contenders")
     given = parser.parse_args(arguments)
-    names = given.contenders.split(",") if given.contenders else list(asked.contenders)
+    names = _split(given.contenders, asked.contenders) if given.contenders else list(asked.contenders)
     if unknown := set(names) - set(asked.contenders):
-        parser.error(f"no contender {', '.join(sorted(unknown))}; there are {', '.join(asked.contenders)}")
-    found, items, seeds = (
-        hands(given.hands.split(";" if ";" in given.hands else ",")),
-        given.objects.split(","),
-        given.seeds,
-    )
+        parser.error(f"no contender {', '.join(sorted(unknown))}; there are {'; '.join(asked.contenders)}")
+    found, items, seeds = hands(_split(given.hands, CONDITIONS)), given.objects.split(","), given.seeds
     if given.quick:
         found = dict(itertools.islice(found.items(), 1))
         names, items, seeds = names[:2], items[: 2 if asked.together else 1], seeds[:1]

@@ -11,7 +11,7 @@ from sessions import TARGETS, directions, foresight, new_objects, there_and_back
 from torch_ekm.experiments.reporting.report import Table
 
 _ANGLES = (9.0, 19.0, 27.0)  # [deg] from fresh grasps
-_WARM_UP = {"learns_by": (19.0, 19.0, 19.0)}  # of the E-KM, before its turns count
+_WARM_UP = {"learns_by": 3}  # turns of the E-KM before those that count
 BY_HAND = {"angles": _ANGLES, **_WARM_UP}
 SHORT = {"angles": (4.0,), "learns_by": ()}
 _ENDS = ("turns", "lost", "reached", "motions", "error [deg]", "other ends")

@@ -42,19 +42,20 @@ def turns(
     seed: int,
     *,
     angles: Sequence[float] | None,
-    learns_by: Sequence[float] = (),
+    learns_by: Sequence[float] | int = (),
     all_learn: bool = False,
 ) -> list[Row]:
     """Turns of an object from fresh grasps, after those in which the hand is learned.
 
     Args:
         angles: None: those of the paper's Table I, or by its rule [deg].
-        learns_by: the E-KM alone makes these first, unless ``all_learn``.
+        learns_by: the E-KM alone makes these first, unless ``all_learn``; a number: so many of the median.
     """
     (item,) = items
     bench = make(item)
     angles = Generalize().angles_of(item) if angles is None else angles
-    first = learns_by if bench.learns or all_learn else ()
+    first = [float(np.median(angles))] * learns_by if isinstance(learns_by, int) else learns_by
+    first = first if bench.learns or all_learn else ()
     asked = [(_FIRST_GRASP + k, angle, "learning" if k else "first") for k, angle in enumerate(first)]
     made = []
     for trial, angle, kind in [*asked, *((k, angle, "turn") for k, angle in enumerate(angles))]:
