@@ -28,6 +28,7 @@ import time
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import MappingProxyType
@@ -166,6 +167,18 @@ def _wiring(path: Path) -> None:
         '[hand]\ndriver = "ros2"\ndescription = "planar_two_finger"\n[bus]\ncommand = "/go"\n'
         '[[motors]]\nname = "left"\n[[motors]]\nname = "right"\n[limits]\nincrement_deg = 20\n'
     )
+
+
+def _knowledge(path: Path) -> None:
+    HandKnowledge.of(load_hand("planar_two_finger")).save(path)
+
+
+def _read_bag(path: Path) -> object:
+    return read_bag(path, "/u")
+
+
+def _read_wiring(path: Path) -> object:
+    return Wiring.read(path, "ros2", 1.0, ("command",), named=True)
 
 
 def _torch() -> torch.Generator:
@@ -358,38 +371,19 @@ TRIAL = {
 
 KINDS = {
     "learner": Kind("learner.ekm", _learner, load, LEARNER),
-    "knowledge": Kind(
-        "hand.ekm",
-        lambda path: HandKnowledge.of(load_hand("planar_two_finger")).save(path),
-        HandKnowledge.load,
-        LEARNER,
-    ),
+    "knowledge": Kind("hand.ekm", _knowledge, HandKnowledge.load, LEARNER),
     "trial": Kind("trial.h5", lambda path: _trajectory().save(path), Trajectory.load, TRIAL),
     "log": Kind("trial_000000.h5", _log, lambda path: verify_log(path.parent), TRIAL),
     "csv": Kind("table.csv", _csv, load_table, CSV),
     "parquet": Kind("table.parquet", _parquet, load_table, {"constant": _constant_rows, "wide": _wide}),
-    "parquet with checksums": Kind(
-        "table.parquet", lambda path: _parquet(path, write_page_checksum=True), load_table
-    ),
+    "parquet with checksums": Kind("table.parquet", partial(_parquet, write_page_checksum=True), load_table),
     "mcap": Kind(
-        "a.mcap",
-        lambda path: _bag(path, StoragePlugin.MCAP),
-        lambda path: read_bag(path, "/u"),
-        {"a chunk of 8 GB": _large_chunk, "packed": lambda path: _packed(path, StoragePlugin.MCAP)},
+        "a.mcap", partial(_bag, plugin=StoragePlugin.MCAP), _read_bag,
+        {"a chunk of 8 GB": _large_chunk, "packed": partial(_packed, plugin=StoragePlugin.MCAP)},
     ),
-    "db3": Kind(
-        "a.db3",
-        lambda path: _bag(path, StoragePlugin.SQLITE3),
-        lambda path: read_bag(path, "/u"),
-        {"endless": _endless_query},
-    ),
-    "bag": Kind(
-        "a.bag",
-        _bag_of_ros_1,
-        lambda path: read_bag(path, "/u"),
-        {"packed": lambda path: _packed(path, None)},
-    ),
-    "rosbag2": Kind("bag/metadata.yaml", _folder, lambda path: read_bag(path.parent, "/u"), YAML),
+    "db3": Kind("a.db3", partial(_bag, plugin=StoragePlugin.SQLITE3), _read_bag, {"endless": _endless_query}),
+    "bag": Kind("a.bag", _bag_of_ros_1, _read_bag, {"packed": partial(_packed, plugin=None)}),
+    "rosbag2": Kind("bag/metadata.yaml", _folder, lambda path: _read_bag(path.parent), YAML),
     "urdf": Kind("hand.urdf", _hand, load_hand, XML),
     "transmission": Kind(
         "hand.transmission.toml", _hand, lambda path: load_hand(path.with_name("hand.urdf")), TOML
@@ -398,10 +392,8 @@ KINDS = {
         "thing.object.toml", _object, lambda path: load_object(path.with_name("thing.urdf")), TOML
     ),
     "mjcf": Kind("hand.xml", _mjcf, load_hand, XML),
-    "wiring": Kind(
-        "hand.toml", _wiring, lambda path: Wiring.read(path, "ros2", 1.0, ("command",), named=True), TOML
-    ),
-}
+    "wiring": Kind("hand.toml", _wiring, _read_wiring, TOML),
+}  # fmt: skip
 
 
 def _sparse(path: Path) -> None:

@@ -18,7 +18,7 @@ PACKAGES = (
     "piqp", "numba", "gpytorch", "scikit-learn", "river", "capymoa", "stable-baselines3",
 )  # fmt: skip
 
-_MOST_ROWS = {True: 10, False: 16}  # of a table that is not folded, with a picture of it and without
+_MOST_ROWS = 8  # of a table that is shown; others are CSV files
 _MOST_LINES = 24  # of printed text that is not folded
 
 
@@ -33,53 +33,67 @@ class Section(NamedTuple):
     """Command, commit, date and time."""
 
 
-def page_text(title: str, sections: list[Section], written: list[str]) -> str:
+def page_text(
+    title: str, sections: list[Section], written: list[str], name: str, files: dict[str, list[list[str]]]
+) -> str:
     """A page: results first, commands and versions last.
 
     Args:
         written: :func:`provenance`.
+        name: of the page, and of the folder with its tables.
+        files: takes the tables that are not shown, by the names of their files.
     """
     lines = [f"# {title}", ""]
     for section in sections:
-        lines += [f"## {section.title}", "", *_laid_out(section.see, section.body), ""]
+        lines += [f"## {section.title}", "", *_laid_out(section, name, files), ""]
     made = [f"- {section.title}: {section.how}" for section in sections]
     return "\n".join([*lines, "## Commands and versions", "", *made, "", *written])
 
 
-def _laid_out(see: str, body: str) -> list[str]:
-    """The answer, a picture and a short first table, then what to see in them; all else is folded."""
-    lead, *tables = re.split(r"^### ", body.strip(), flags=re.MULTILINE)
-    blocks = [block for block in re.split(r"\n{2,}", lead.strip()) if block] if "```" not in lead else [lead]
-    first, rest = [], []
-    most = _MOST_ROWS["![" in lead]
-    while blocks:
-        block = blocks.pop(0).strip()
-        if block.startswith("!["):  # and its caption
-            picture = "\n\n".join([block, *([blocks.pop(0)] if blocks and blocks[0].startswith("*") else [])])
-            (rest if any("![" in one for one in first) else first).append(picture)
-        elif block.startswith("|") and _rows(block) > most:
-            rest.append(_folded(f"Table of {_rows(block)} rows", block))
+def _laid_out(section: Section, name: str, files: dict[str, list[list[str]]]) -> list[str]:
+    """The answer, a picture and a short table, then what to see in them; other tables are files."""
+    shown, links, caption, tables, pictures, kept = [], [], section.title, 0, 0, True
+    for block in _blocks(section.body):
+        if block.startswith("### "):
+            caption = block.removeprefix("### ")
+        elif block.startswith("|"):
+            kept = tables == 0 and _rows(block) <= _MOST_ROWS
+            tables += kept
+            if kept:
+                shown += [*([f"### {caption}"] if caption != section.title else []), block]
+                continue
+            stem = re.sub(r"[^a-z0-9]+", "_", caption.lower()).strip("_")[:48]
+            count = sum(re.fullmatch(rf"{stem}(_\d+)?\.csv", known) is not None for known in files)
+            file = f"{stem}_{count + 1}.csv" if count else f"{stem}.csv"
+            files[file] = _cells(block)
+            links.append(f"[{caption}]({name}/{file})")
+        elif block.startswith(("![", "*")) and not block.startswith("**"):  # a picture, then its caption
+            pictures += block.startswith("![")
+            shown += [block] if pictures == 1 else []
         elif block.startswith("```") and block.count("\n") > _MOST_LINES + 1:
-            rest.append(_folded("Printed output", block))
-        else:
-            (rest if block.startswith("- **") else first).append(block)
-    for k, table in enumerate(tables):
-        caption, _, text = table.partition("\n")
-        short = k == 0 and _rows(text) <= most
-        (first if short else rest).append(
-            f"### {caption}\n\n{text.strip()}" if short else _folded(caption, text.strip())
-        )
-    first = [*first, see] if "![" in lead else [see, *first]
-    return "\n\n".join([*first, *rest]).splitlines()
+            shown.append(f"<details>\n<summary>Printed output</summary>\n\n{block}\n\n</details>")
+        elif kept or not tables:  # the note of a table goes with it
+            shown.append(block)
+    below = (k for k, block in enumerate(shown) if block.startswith(("###", "|", "`", "<")))
+    shown.insert(next(below, len(shown)) if pictures else 0, section.see)
+    return "\n\n".join([*shown, *([f"Tables: {', '.join(links)}."] if links else [])]).splitlines()
+
+
+def _blocks(body: str) -> list[str]:
+    parts = re.split(r"(```.*?```)", body.strip(), flags=re.DOTALL)
+    split = ([part] if part.startswith("```") else re.split(r"\n{2,}", part.strip()) for part in parts)
+    return [block.strip() for blocks in split for block in blocks if block.strip()]
 
 
 def _rows(markdown: str) -> int:
     return sum(line.startswith("|") for line in markdown.splitlines()) - 2
 
 
-def _folded(caption: str, text: str) -> str:
-    """HTML around Markdown, which begins after an empty line."""
-    return f"<details>\n<summary>{caption}</summary>\n\n{text}\n\n</details>"
+def _cells(markdown: str) -> list[list[str]]:
+    lines = [line for k, line in enumerate(markdown.splitlines()) if line.startswith("|") and k != 1]
+    return [
+        [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines
+    ]
 
 
 def commit() -> str:

@@ -13,6 +13,7 @@ Recordings are read from ``TORCH_EKM_DATA``.
 from __future__ import annotations
 
 import argparse
+import csv
 import dataclasses
 import datetime
 import json
@@ -161,7 +162,12 @@ def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
             shutil.copy(folder / "report" / f"{picture}.svg", page.parent / name)
     written = provenance(f"python benchmarks/write_pages.py {name}")
     page.parent.mkdir(parents=True, exist_ok=True)
-    page.write_text(page_text(PLAN[name]["title"], sections, written), encoding="utf-8")
+    files: dict[str, list[list[str]]] = {}
+    page.write_text(page_text(PLAN[name]["title"], sections, written, name, files), encoding="utf-8")
+    for file, rows in files.items():
+        (page.parent / name).mkdir(exist_ok=True)
+        with (page.parent / name / file).open("w", newline="", encoding="utf-8") as stream:
+            csv.writer(stream, lineterminator="\n").writerows(rows)
     print(f"{page}", flush=True)
 
 

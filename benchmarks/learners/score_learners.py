@@ -15,11 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 from gpytorch_svgp import GPyTorchSVGP
-from krls_tracker import KRLSTracker
-from network_peers import BayesianLastLayer, LowRankKalman
 from stream_scores import load_split, score_objects, score_split
 
-from torch_ekm.enhanced.grasp_learner import NOISE_VARIANCE
 from torch_ekm.experiments.learner_comparison.recordings import load_t42
 from torch_ekm.experiments.learner_comparison.stream import Stream
 from torch_ekm.experiments.learners import LEARNERS, Factory
@@ -29,23 +26,12 @@ from torch_ekm.residual import (
     MixtureResidual,
     ProcessNoise,
     ResidualLearner,
-    SquaredExponential,
 )
 
 
 def chosen(name: str, **options: Any) -> Factory:
     """A learner of the registry with other figures."""
     return lambda d, m: LEARNERS[name](d, m, **options)
-
-
-def krls(**options: Any) -> Factory:
-    """KRLS-T of 100 basis vectors, the prior of the others."""
-    return lambda d, m: KRLSTracker(
-        d,
-        m,
-        kernel=SquaredExponential(d),
-        **{"standardize": False, "noise_variance": NOISE_VARIANCE, **options},
-    )
 
 
 _LOUD: dict[str, Any] = {"noise_variance": 0.3}
@@ -66,7 +52,6 @@ HAND: dict[str, Factory] = {
     "deep SOGP, process noise .003, robust 3": chosen("SOGP deep", parts=_WANDERING, **_LOUD),
     "RLS, forgetting .99, robust 3": chosen("linear RLS", **_LOUD),
     "random features, forgetting .99, robust 3": chosen("random features", **_LOUD),
-    "KRLS-T 100, forgetting .99": krls(forgetting_factor=0.99, **_LOUD),
     "ensemble of four networks": chosen("MLP ensemble", members=4),
     "river, adaptive random forest": chosen("river forest"),
 }
@@ -81,10 +66,7 @@ STREAMS: dict[str, Factory] = {
     "SOGP 300, adaptation": chosen("SOGP plain", capacity=300, parts=[LearnHyperparameters()]),
     "deep SOGP 100": chosen("SOGP deep", parts=(), robust=None),
     "deep SOGP 300": chosen("SOGP deep", parts=(), robust=None, capacity=300),
-    "KRLS-T 100": krls(),
     "GPyTorch SVGP 100": GPyTorchSVGP,
-    "Bayesian last layer (VBLL), replayed": BayesianLastLayer,
-    "network by a low-rank Kalman filter": LowRankKalman,
     "river, adaptive random forest": chosen("river forest"),
     "ensemble of four networks, all replayed": chosen("MLP ensemble", members=4, memory=10_000),
 }

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+import torch_ekm
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.experiments.jobs import run_jobs
@@ -19,12 +22,10 @@ from torch_ekm.typing import Array
 
 from .adapting import adapting_predictions
 from .finger_markers import FingerMarkers
-from .fingerprint import fingerprint
 from .fingers import identify_markers
 from .learning import learned_predictions
 from .nominal import (
     NOMINALS,
-    Nominal,
     Samples,
     calibrate_hand,
     jacobians,
@@ -33,17 +34,15 @@ from .nominal import (
     through_play,
 )
 from .recordings import APART, RecordedPath, known_diameter, read_recordings
-from .scores import Row, score
+from .scores import SUBSETS, Row, score
 from .states import States, estimate_states
 from .synthetic import OBJECTS, write_synthetic
 
 HAND = "yale_t42"
 HORIZONS = (10, 50)
 """[steps of 0.1 s] at which learners are scored, too."""
-CURVE = (10, 20, 30, 50, 100)
-"""Horizons of the picture of the models alone."""
 LEARNER = "SOGP mixture"
-SUBSETS = ("all", "first", "first, smooth", "changed")
+_LEARNED = [nominal for nominal in NOMINALS if nominal.kind in ("none", "calibrated", "online")]
 
 Predicted = dict[str, Array]
 
@@ -114,7 +113,17 @@ def predict_recorded_hand(
             raise UnknownNameError("learner", name, LEARNERS)
     with TemporaryDirectory() as temporary:
         paths = _chosen(data, temporary, quick)
-        return _run(paths, tuple(learners), Path(folder or temporary), processes, quick, on_done)
+        cache = Path(folder or temporary) / _digest(paths, quick)
+        return _Run(load_hand(HAND), paths, cache, processes, quick, on_done).result(tuple(learners))
+
+
+def _digest(paths: dict[str, list[RecordedPath]], quick: bool) -> str:
+    """Ten letters that change with the recordings and the version of the package."""
+    found = hashlib.sha256(f"{torch_ekm.__version__} {quick} {list(paths)}".encode())
+    for path in itertools.chain.from_iterable(paths.values()):
+        for values in vars(path).values():
+            found.update(values.tobytes())
+    return found.hexdigest()[:10]
 
 
 def count_jobs(data: str | Path | None, learners: int, *, quick: bool = False) -> int:
@@ -124,7 +133,7 @@ def count_jobs(data: str | Path | None, learners: int, *, quick: bool = False) -
         DescriptionError: as :func:`predict_recorded_hand`.
     """
     paths = OBJECTS if data is None else _chosen(data, "", quick)
-    return len(paths) + 1 + len({*HORIZONS, *CURVE}) + learners * len(NOMINALS) * len(HORIZONS)
+    return len(paths) + 1 + len(HORIZONS) + learners * len(_LEARNED) * len(HORIZONS)
 
 
 def _chosen(data: str | Path | None, temporary: str, quick: bool) -> dict[str, list[RecordedPath]]:
@@ -137,128 +146,107 @@ def _chosen(data: str | Path | None, temporary: str, quick: bool) -> dict[str, l
     return {name: paths[name][:2] for name in few}
 
 
-def _run(
-    paths: dict[str, list[RecordedPath]],
-    learners: tuple[str, ...],
-    cache: Path,
-    processes: int,
-    quick: bool,
-    on_done: Callable[[str], None] | None,
-) -> RecordedHandResult:
-    hand, apart = load_hand(HAND), paths[APART]
-    diameter = known_diameter(APART)
-    assert diameter is not None  # its name states it
-    markers = identify_markers(
-        hand,
-        np.concatenate([path.markers for path in apart]),
-        np.concatenate([path.pose for path in apart]),
-        diameter,
-    )
-    jobs = {name: (name, own, markers, hand) for name, own in paths.items()}
-    states = {
-        name: States.of(result)
-        for name, result in _cached("states", _states, jobs, cache, processes, on_done).items()
-    }
-    job = {APART: (hand, apart, states[APART], diameter)}
-    found = _cached("calibration", _calibration, job, cache, 1, on_done)[APART]
+@dataclass(frozen=True)
+class _Run:
+    """The recordings of a run, and where and how its jobs are done."""
 
-    moved = {name: through_play(own, hand) for name, own in paths.items()}
-    by_state = {
-        "published": {name: jacobians(hand, own, rigid=True) for name, own in states.items()},
-        "calibrated": {
-            name: jacobians(_calibrated(hand, found), own, rigid=False) for name, own in states.items()
-        },
-    }
-    samples = {
-        horizon: {name: take_samples(own, states[name], moved[name], horizon) for name, own in paths.items()}
-        for horizon in sorted({*HORIZONS, *CURVE})
-        if all(max(map(len, own)) > horizon for own in paths.values())
-    }
-    alone = {
-        (nominal.name, horizon): predictions(nominal, taken, by_state, APART)
-        for horizon, taken in samples.items()
-        for nominal in NOMINALS
-        if nominal.kind != "online"
-    } | _online(hand, samples, states, by_state["published"], cache, processes, on_done)
-    predicted = alone | _with_learners(learners, samples, states, alone, cache, processes, quick, on_done)
-    reported = [name for name in paths if name != APART]
-    rows = []
-    for (name, horizon), own in predicted.items():
-        taken = {key: samples[horizon][key] for key in reported}
-        unit = samples[horizon][APART].motion.std(axis=0)
-        for subset in SUBSETS if horizon in HORIZONS else SUBSETS[:1]:
-            rows.append(score(name, horizon, subset, taken, own, unit))
-    return RecordedHandResult(paths, states, samples, predicted, rows, markers, found, quick)
+    hand: HandDescription
+    paths: dict[str, list[RecordedPath]]
+    cache: Path
+    processes: int
+    quick: bool
+    on_done: Callable[[str], None] | None
+
+    def __call__(
+        self, kind: str, function: Callable[..., Any], jobs: dict[str, tuple[Any, ...]]
+    ) -> dict[str, Any]:
+        """:func:`run_jobs`, in the folder of these recordings."""
+        files = {f"{kind}_{''.join(c if c.isalnum() else '_' for c in name)}": name for name in jobs}
+        named = {file: jobs[name] for file, name in files.items()}
+        results = run_jobs(function, named, self.cache, self.processes, self.on_done)
+        return {files[file]: result for file, result in results.items()}
+
+    def result(self, learners: tuple[str, ...]) -> RecordedHandResult:
+        """Everything, from markers to scores."""
+        hand, apart = self.hand, self.paths[APART]
+        diameter = known_diameter(APART)
+        assert diameter is not None  # its name states it
+        seen, pose = (np.concatenate([getattr(path, part) for path in apart]) for part in ("markers", "pose"))
+        markers = identify_markers(hand, seen, pose, diameter)
+        found = self(
+            "states", _states, {name: (name, own, markers, hand) for name, own in self.paths.items()}
+        )
+        states = {name: States.of(plain) for name, plain in found.items()}
+        calibration = self("calibration", _calibration, {APART: (hand, apart, states[APART], diameter)})[
+            APART
+        ]
+        calibrated = _calibrated(hand, calibration)
+        by_state = {
+            "published": {name: jacobians(hand, own, rigid=True) for name, own in states.items()},
+            "calibrated": {name: jacobians(calibrated, own, rigid=False) for name, own in states.items()},
+        }
+        moved = {name: through_play(own, hand) for name, own in self.paths.items()}
+        samples = {
+            horizon: {
+                name: take_samples(own, states[name], moved[name], horizon)
+                for name, own in self.paths.items()
+            }
+            for horizon in HORIZONS
+        }
+        predicted = {
+            (nominal.name, horizon): predictions(nominal, taken, by_state, APART)
+            for horizon, taken in samples.items()
+            for nominal in NOMINALS
+            if nominal.kind != "online"
+        }
+        order = sorted(name for name in states if name != APART)
+        (online,) = (nominal for nominal in NOMINALS if nominal.kind == "online")
+        adapting = hand, states, by_state["published"], [APART, *order]
+        jobs = {str(horizon): (taken, *adapting) for horizon, taken in samples.items()}
+        for horizon, result in self("online", _adapting, jobs).items():
+            predicted[online.name, int(horizon)] = _arrays(result)
+        jobs, keys, limit = {}, {}, 40 if self.quick else None
+        for horizon, nominal, learner in itertools.product(
+            sorted(HORIZONS, reverse=True), _LEARNED, learners
+        ):
+            key = f"{nominal.name} + {learner}"  # few samples first
+            own = samples[horizon], states, predicted[nominal.name, horizon]
+            jobs[f"{key} {horizon}"] = learner, nominal, *own, order, APART, limit
+            keys[f"{key} {horizon}"] = key, horizon
+        for job, result in self("learned", _learned, jobs).items():
+            predicted[keys[job]] = _arrays(result)
+        rows = []
+        for (name, horizon), own in predicted.items():
+            taken = {key: samples[horizon][key] for key in order}
+            unit = samples[horizon][APART].motion.std(axis=0)
+            rows += [score(name, horizon, subset, taken, own, unit) for subset in SUBSETS]
+        return RecordedHandResult(
+            self.paths, states, samples, predicted, rows, markers, calibration, self.quick
+        )
 
 
-def _online(
-    hand: HandDescription,
-    samples: dict[int, dict[str, Samples]],
-    states: dict[str, States],
-    usual: dict[str, Array],
-    cache: Path,
-    processes: int,
-    on_done: Callable[[str], None] | None,
-) -> dict[tuple[str, int], Predicted]:
-    """The figures begin as published, and see the recording set apart first."""
-    order = [APART, *sorted(name for name in states if name != APART)]
-    jobs = {str(horizon): (hand, taken, states, usual, order) for horizon, taken in samples.items()}
-    results = _cached("online", _adapting, jobs, cache, processes, on_done)
-    (online,) = [nominal for nominal in NOMINALS if nominal.kind == "online"]
-    return {
-        (online.name, int(horizon)): {name: np.array(one).reshape(-1, 3) for name, one in result.items()}
-        for horizon, result in results.items()
-    }
+def _arrays(plain: dict[str, Any]) -> Predicted:
+    return {name: np.array(values).reshape(-1, 3) for name, values in plain.items()}
 
 
-def _adapting(
-    hand: HandDescription,
-    samples: dict[str, Samples],
-    states: dict[str, States],
-    usual: dict[str, Array],
-    order: list[str],
-) -> dict[str, Any]:
-    found = adapting_predictions(hand, samples, states, usual, order)
+def _plain(found: Predicted) -> dict[str, Any]:
     return {name: values.tolist() for name, values in found.items()}
 
 
-def _with_learners(
-    learners: tuple[str, ...],
-    samples: dict[int, dict[str, Samples]],
-    states: dict[str, States],
-    alone: dict[tuple[str, int], Predicted],
-    cache: Path,
-    processes: int,
-    quick: bool,
-    on_done: Callable[[str], None] | None,
-) -> dict[tuple[str, int], Predicted]:
-    order = sorted(name for name in states if name != APART)
-    jobs, keys = {}, {}
-    for horizon in sorted(HORIZONS, reverse=True):  # few samples first
-        for nominal in NOMINALS:
-            for learner in learners:
-                key = f"{nominal.name} + {learner}"
-                job = f"{key} {horizon}"
-                own = samples[horizon], states, alone[nominal.name, horizon]
-                jobs[job] = (learner, nominal, *own, order, 40 if quick else None)
-                keys[job] = key, horizon
-    results = _cached("learned", _learned, jobs, cache, processes, on_done)
-    return {
-        keys[job]: {name: np.array(values).reshape(-1, 3) for name, values in result.items()}
-        for job, result in results.items()
-    }
+def _states(*given: Any) -> dict[str, Any]:
+    return estimate_states(*given).plain()
 
 
-def _states(
-    name: str, paths: list[RecordedPath], markers: FingerMarkers, hand: HandDescription
-) -> dict[str, Any]:
-    return estimate_states(name, paths, markers, hand).plain()
+def _adapting(samples: dict[str, Samples], hand: HandDescription, *given: Any) -> dict[str, Any]:
+    return _plain(adapting_predictions(hand, samples, *given))
 
 
-def _calibration(
-    hand: HandDescription, paths: list[RecordedPath], states: States, diameter: float
-) -> dict[str, Any]:
-    found = calibrate_hand(hand, paths, states, diameter)
+def _learned(*given: Any) -> dict[str, Any]:
+    return _plain(learned_predictions(*given))
+
+
+def _calibration(*given: Any) -> dict[str, Any]:
+    found = calibrate_hand(*given)
     return {
         "springs": found.hand.spring_stiffness.tolist(),
         "moment_arms": found.hand.actuation_jacobian.tolist(),
@@ -272,48 +260,5 @@ def _calibrated(hand: HandDescription, found: dict[str, Any]) -> HandDescription
         dataclasses.replace(actuator, stiffness=stiffness)
         for actuator, stiffness in zip(hand.actuators, found["stiffness"], strict=True)
     )
-    return dataclasses.replace(
-        hand,
-        spring_stiffness=np.array(found["springs"]),
-        actuation_jacobian=np.array(found["moment_arms"]),
-        actuators=actuators,
-    )
-
-
-def _learned(
-    learner: str,
-    nominal: Nominal,
-    samples: dict[str, Samples],
-    states: dict[str, States],
-    alone: Predicted,
-    order: list[str],
-    limit: int | None,
-) -> dict[str, Any]:
-    found = learned_predictions(learner, nominal, samples, states, alone, order, APART, limit)
-    return {name: values.tolist() for name, values in found.items()}
-
-
-def _cached(
-    kind: str,
-    function: Callable[..., Any],
-    jobs: dict[str, tuple[Any, ...]],
-    cache: Path,
-    processes: int,
-    on_done: Callable[[str], None] | None,
-) -> dict[str, Any]:
-    """:func:`run_jobs`, each job's file named after what decides its result."""
-    files = {}
-    digests: dict[int, str] = {}  # most arguments are those of all jobs
-
-    def digest(value: object) -> str:
-        if id(value) not in digests:
-            digests[id(value)] = fingerprint(value)
-        return digests[id(value)]
-
-    for name, arguments in jobs.items():
-        plain = "".join(c if c.isalnum() else "_" for c in name)
-        decides = fingerprint(*map(digest, (function, *arguments)))
-        files[f"{kind}_{plain}_{decides[:10]}"] = name
-    named = {file: jobs[name] for file, name in files.items()}
-    results = run_jobs(function, named, cache, processes, on_done)
-    return {files[file]: result for file, result in results.items()}
+    springs, arms = np.array(found["springs"]), np.array(found["moment_arms"])
+    return dataclasses.replace(hand, spring_stiffness=springs, actuation_jacobian=arms, actuators=actuators)

@@ -26,7 +26,6 @@ CALIBRATED = ("springs", "moment_arms", "stiffness")
 EVERY = 5
 """States between two that the calibration takes for rests: 5 s."""
 LARGEST = 0.2  # [m/rad]: a Jacobian five times that of the hand's middle is not believed
-_SMOOTH = 2  # frames on either side whose median is a less noisy pose
 
 
 @dataclass(frozen=True)
@@ -35,22 +34,19 @@ class Nominal:
 
     name: str
     kind: str
-    """"none", "constant", "constant per object", "published", "calibrated" or "online" (adapting.py)."""
+    """"none", "constant", "published", "calibrated" or "online" (adapting.py)."""
     play: bool = False
     """Whether the motors' motion goes through the play of the drive first."""
 
 
 NOMINALS = (
     Nominal("no model", "none"),
-    Nominal("constant Jacobian", "constant"),
     Nominal("constant Jacobian, play", "constant", play=True),
-    Nominal("constant Jacobian per object", "constant per object", play=True),
     Nominal("KM, published figures", "published"),
     Nominal("KM, published figures, play", "published", play=True),
     Nominal("KM, calibrated, play", "calibrated", play=True),
     Nominal("KM, figures online, play", "online", play=True),
 )
-"""The one fitted to each object sees what it is tested on: an upper reference for what is constant."""
 
 
 class Samples(NamedTuple):
@@ -61,14 +57,10 @@ class Samples(NamedTuple):
     path: NDArray[np.int64]
     motion: Array
     """x, y [m] and angle [rad], camera axes ``(n, 3)``."""
-    smooth: Array
-    """The same between medians of five frames."""
     delta_a: Array
     """Of the motors, left and right ``(n, 2)`` [rad]."""
     transmitted: Array
     """What of it leaves the play ``(n, 2)`` [rad]."""
-    changed: NDArray[np.bool_]
-    """A command changed in the second before or on the way ``(n,)``."""
     loads: Array
     """At the beginning ``(n, 2)``."""
     horizon: int
@@ -103,17 +95,13 @@ def take_samples(
         end = t + horizon
         if end >= len(path):
             continue
-        recent = path.delta_a[max(0, t - STRIDE) : end]
-        smooth = [np.median(path.pose[max(0, i - _SMOOTH) : i + _SMOOTH + 1], axis=0) for i in (t, end)]
         rows.append(
             (
                 k,
                 number,
                 path.pose[end] - path.pose[t],
-                smooth[1] - smooth[0],
                 path.delta_a[t:end].sum(0),
                 moved[number][t:end].sum(0),
-                bool((np.diff(recent, axis=0) != 0).any()),
                 path.loads[t],
             )
         )
@@ -165,7 +153,7 @@ def predictions(
         if nominal.kind in by_state:
             J = by_state[nominal.kind][name][taken.row]
         else:
-            fitted = samples[apart if nominal.kind == "constant" else name]
+            fitted = samples[apart]
             J = constant_jacobian(action_of(nominal, fitted), fitted.motion)
         found[name] = np.einsum("...ij,nj->ni" if J.ndim == 2 else "nij,nj->ni", J, action)
     return found

@@ -1,4 +1,4 @@
-"""What is scored: errors over motions, for each coordinate, with paired intervals over objects."""
+"""What is scored: errors over motions, for each coordinate, with intervals over objects."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torch_ekm.experiments.learner_comparison.scores import block_bootstrap
 from torch_ekm.experiments.reporting.statistics import Estimate
@@ -17,6 +16,7 @@ from .nominal import Samples
 COORDINATES = ("x", "y", "angle")
 FIRST = 50
 """Samples of an object that count as its first."""
+SUBSETS = {"all": "all samples", "first": f"the first {FIRST} samples of each object"}
 _CUT = 0.99  # quantile of each coordinate at which errors and motions are cut: an object that drops
 
 
@@ -27,24 +27,11 @@ class Row(NamedTuple):
     horizon: int
     """[steps of 0.1 s]"""
     subset: str
-    """"all", "first", "first, smooth" or "changed"."""
+    """A key of :data:`SUBSETS`."""
     ratio: dict[str, Estimate]
     """Of each coordinate: rms error over rms motion, cut; 1: as if nothing moved."""
     rms: float
     """rms error of all coordinates in units of their spread, over that of the motion: mean over objects."""
-    median: float
-    """The same of the median absolute values, of objects that move in more than half of the samples."""
-
-
-def subsets(samples: Mapping[str, Samples]) -> dict[str, dict[str, NDArray[np.bool_]]]:
-    """Which samples of each object count, by name of the subset."""
-    first = {name: np.arange(len(taken.motion)) < FIRST for name, taken in samples.items()}
-    return {
-        "all": {name: np.ones(len(taken.motion), dtype=bool) for name, taken in samples.items()},
-        "first": first,
-        "first, smooth": first,
-        "changed": {name: taken.changed for name, taken in samples.items()},
-    }
 
 
 def score(
@@ -62,36 +49,18 @@ def score(
         predicted: of the same objects.
         unit: spread of the motion of the recording set apart ``(3,)``.
     """
-    chosen = subsets(samples)[subset]
-    motion, error = {}, {}
-    for key, taken in samples.items():
-        true = taken.smooth if subset == "first, smooth" else taken.motion
-        motion[key], error[key] = true[chosen[key]], (true - predicted[key])[chosen[key]]
+    first = FIRST if subset == "first" else None
+    motion = {key: taken.motion[:first] for key, taken in samples.items()}
+    error = {key: motion[key] - predicted[key][:first] for key in samples}
     blocks = np.repeat(np.arange(len(samples)), [len(part) for part in motion.values()])
-    squared = [_cut(np.concatenate(list(parts.values()))) ** 2 for parts in (error, motion)]
-    ratio = {
-        c: block_bootstrap(squared[0][:, k], squared[1][:, k], blocks) for k, c in enumerate(COORDINATES)
-    }
-    used = [key for key in samples if len(motion[key])]
-    rms = [np.sqrt(np.mean((error[k] / unit) ** 2) / np.mean((motion[k] / unit) ** 2)) for k in used]
-    middle = [[np.median(np.abs(parts[k] / unit)) for parts in (error, motion)] for k in used]
-    median = [ours / theirs for ours, theirs in middle if theirs > 0]
-    return Row(
-        name, horizon, subset, ratio, float(np.mean(rms)), float(np.mean(median)) if median else np.nan
-    )
-
-
-def compare_errors(
-    samples: Mapping[str, Samples], ours: Mapping[str, Array], theirs: Mapping[str, Array]
-) -> dict[str, Estimate]:
-    """Of each coordinate: rms error of ours over theirs, cut, 95 % interval over objects, paired."""
-    lengths = [len(taken.motion) for taken in samples.values()]
-    blocks = np.repeat(np.arange(len(samples)), lengths)
-    squared = [
-        _cut(np.concatenate([taken.motion - predicted[name] for name, taken in samples.items()])) ** 2
-        for predicted in (ours, theirs)
+    wrong, moved = (_cut(np.concatenate(list(parts.values()))) ** 2 for parts in (error, motion))
+    ratio = {c: block_bootstrap(wrong[:, k], moved[:, k], blocks) for k, c in enumerate(COORDINATES)}
+    rms = [
+        np.sqrt(np.mean((error[key] / unit) ** 2) / np.mean((motion[key] / unit) ** 2))
+        for key in samples
+        if len(motion[key])
     ]
-    return {c: block_bootstrap(squared[0][:, k], squared[1][:, k], blocks) for k, c in enumerate(COORDINATES)}
+    return Row(name, horizon, subset, ratio, float(np.mean(rms)))
 
 
 def _cut(values: Array) -> Array:

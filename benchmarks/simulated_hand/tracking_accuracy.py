@@ -1,22 +1,17 @@
-"""How well does the tracker see? ``benchmarks/simulated_hand/tracking_accuracy.py --frames 1000 --seed 1000``
-
-Two marker boards are drawn in random poses and found again; prints the figures of docs/benchmarks/sensing.md.
-"""
+"""How well does the tracker see? Two marker boards are drawn in random poses and found again."""
 
 from __future__ import annotations
 
-import argparse
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torch_ekm._extras import require
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera
-from torch_ekm.simulation import ImageQuality, SimulatedCamera
+from torch_ekm.simulation import SimulatedCamera
 from torch_ekm.simulation.imaging.card_scene import CardScene, PlacedCard
 
 Array = NDArray[np.float64]
@@ -53,9 +48,6 @@ class TrackingAccuracy:
     """CPU time of one image."""
     track_ms: float
     """CPU time of finding both boards in it."""
-
-    def __str__(self) -> str:
-        return "\n".join(f"{field.name:22s} {getattr(self, field.name):.4g}" for field in fields(self))
 
 
 def measure_tracking(
@@ -156,21 +148,3 @@ def _board_error(truth: Array, rotation: Array, position: Array) -> Array:
     in_plane = turn @ normal
     out_of_plane = np.sqrt(max(turn @ turn - in_plane**2, 0.0))
     return np.array([in_plane, out_of_plane, offset @ right, offset @ np.cross(sight, right), depth])
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=1000)
-    parser.add_argument("--noise", type=float, default=ImageQuality.noise, help="grey levels")
-    parser.add_argument("--blur", type=float, default=ImageQuality.blur, help="px")
-    parser.add_argument("--corners-only", action="store_true", help="no refinement on edges")
-    given = parser.parse_args()
-    require("cv2").setNumThreads(1)
-    torch.set_num_threads(1)
-    camera = SimulatedCamera(quality=ImageQuality(blur=given.blur, noise=given.noise))
-    print(measure_tracking(given.frames, given.seed, camera, edges=not given.corners_only))
-
-
-if __name__ == "__main__":
-    main()

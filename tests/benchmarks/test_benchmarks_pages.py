@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import pytest
 pytest.importorskip("write_pages", reason="the benchmarks are not part of this installation")
 
 import write_pages
-from bars import Target, targets_table
 from dots import dot_chart
 from page import Section, page_text
 
@@ -87,7 +84,7 @@ def test_half_a_result_of_another_commit_is_not_gone_on_with(
 def test_an_unknown_page_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         write_pages.main(["nothing"])
-    assert "no page nothing; there are demo" in capsys.readouterr().err
+    assert "no page nothing; there are paper" in capsys.readouterr().err
 
 
 def test_a_report_comes_with_its_headings_below_the_pages(
@@ -109,32 +106,35 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     text = (tmp_path / "out" / "one.md").read_text(encoding="utf-8")
     assert "# Title" not in text
     assert "An answer.\n" in text
-    assert "\n![Seen.](one/shown.svg)\n\n*Seen.*\n\n### A table\n\n| a | c |" in text
+    assert "\n![Seen.](one/shown.svg)\n\n*Seen.*\n\nLook.\n\n### A table\n\n| a | c |" in text
     assert "| - | 0.50 |\n| 1\\|2 |  |\n\nA note." in text
     assert "Left out" not in text
     assert (tmp_path / "out" / "one" / "shown.svg").exists()
     assert sys.executable not in text
 
 
-def test_results_come_first_and_long_tables_are_folded() -> None:
+def test_results_come_first_and_long_tables_are_files() -> None:
     def table(rows: int) -> str:
         return "\n".join(["| a |", "|---|", *(f"| {k} |" for k in range(rows))])
 
     picture = "![Seen.](a.svg)\n\n*Seen.*"
-    legend = "- **KM**: the model"
-    body = f"Answer.\n\n{legend}\n\n{picture}\n\n### Short\n\n{table(10)}\n\nNote.\n\n### Other\n\n{table(2)}"
-    text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["Written by it."])
-    folded = f"<details>\n<summary>Other</summary>\n\n{table(2)}\n\n</details>"
-    shown = ["Answer.", picture, f"### Short\n\n{table(10)}\n\nNote.", "See.", legend, folded]
-    made = "## Commands and versions\n\n- Part: `run`: commit 1.\n\nWritten by it."
+    body = f"Answer.\n\n{picture}\n\n### Short\n\n{table(8)}\n\nNote.\n\n### Other\n\n{table(2)}\n\nIts note."
+    files: dict[str, list[list[str]]] = {}
+    text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["By it."], "one", files)
+    shown = [
+        "Answer.",
+        picture,
+        "See.",
+        f"### Short\n\n{table(8)}\n\nNote.",
+        "Tables: [Other](one/other.csv).",
+    ]
+    made = "## Commands and versions\n\n- Part: `run`: commit 1.\n\nBy it."
     assert text == "\n\n".join(["# Page\n\n## Part", *shown, made])
-    long = page_text("Page", [Section("Part", "See.", body.replace(table(10), table(11)), "")], [])
-    assert f"<summary>Short</summary>\n\n{table(11)}" in long
-    bare = page_text("Page", [Section("Part", "See.", table(16), "")], [])  # no picture shows what is in it
-    assert "<details>" not in bare
-    assert "<summary>Table of 17 rows</summary>" in page_text(
-        "Page", [Section("P", "See.", table(17), "")], []
-    )
+    assert files == {"other.csv": [["a"], ["0"], ["1"]]}
+    long = page_text("Page", [Section("Part", "See.", table(9), "")] * 2, [], "one", files)
+    assert "Tables: [Part](one/part.csv).\n" in long
+    assert "Tables: [Part](one/part_2.csv).\n" in long
+    assert len(files["part.csv"]) == 10
 
 
 TABLES = """Answer.
@@ -169,16 +169,6 @@ def test_tables_are_drawn_with_their_intervals(tmp_path: Path) -> None:
     assert single.lines[0].get_color() != km  # ours, in bold
 
 
-def test_targets_say_by_how_much_they_are_missed() -> None:
-    assert Target("x", 20.0, most=25).missed_by == 0
-    assert Target("x", 30.0, most=25).missed_by == 5
-    assert Target("x", 80.0, least=90).missed_by == 10
-    assert Target("x", 0.5, least=1, most=3).missed_by == 0.5
-    table = targets_table([Target("a", 20.0, most=25), Target("b", 30.0, most=25), Target("c", 1.0, least=2)])
-    assert table.header == ["figure", "measured", "bar", "missed by"]
-    assert table.text() == [["b", "30", "25", "5"], ["c", "1", "2", "1"]]  # what is met is not listed
-
-
 def test_no_page_says_that_a_bar_is_met() -> None:
     pages = [*(write_pages.HERE.parent / "docs").rglob("*.md"), write_pages.HERE.parent / "README.md"]
     assert not [page.name for page in pages if re.search(r"\|\s*met\s*\|", page.read_text("utf-8"))]
@@ -191,19 +181,3 @@ SCRIPTS = [path for path in write_pages.HERE.glob("**/*.py") if path.parent.name
 def test_every_script_can_be_imported(script: Path) -> None:
     """What nobody runs in a test still follows the package's names."""
     importlib.import_module(script.stem)
-
-
-@pytest.mark.parametrize(
-    "script",
-    sorted(
-        path for path in SCRIPTS if path.parent.name == "studies" and "__main__" in path.read_text("utf-8")
-    ),
-    ids=lambda path: path.stem,
-)
-def test_studies_start_from_the_command_line(script: Path) -> None:
-    """Where their own folder alone is on the path, and not those that the tests add."""
-    environment = {**os.environ, "PYTHONPATH": str(write_pages.ROOT)}
-    done = subprocess.run(
-        [sys.executable, str(script), "--help"], capture_output=True, text=True, env=environment, check=False
-    )
-    assert done.returncode == 0, done.stderr

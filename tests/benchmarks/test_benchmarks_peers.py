@@ -12,8 +12,7 @@ pytest.importorskip("capymoa_regressor", reason="the benchmarks are not part of 
 
 from capymoa_regressor import CapyMOARegressor
 
-from torch_ekm.residual import LearnHyperparameters, SparseOnlineGP, SquaredExponential, Standardize
-from torch_ekm.testing import check_residual_learner
+from torch_ekm.residual import LearnHyperparameters, SparseOnlineGP, Standardize
 
 
 def small(d: int, m: int) -> SparseOnlineGP:
@@ -66,65 +65,3 @@ def test_gpytorch_learns() -> None:
     assert (learner(x) - y).square().mean() < 0.3 * y.square().mean()
     law = learner.predict(x, observation=True)
     assert law.mean.shape == law.stddev.shape == y.shape
-
-
-@pytest.mark.parametrize("name", ["BayesianLastLayer", "LowRankKalman"])
-def test_networks_learn(name: str) -> None:
-    if name == "BayesianLastLayer":
-        pytest.importorskip("vbll")
-    import network_peers
-
-    draw = torch.Generator().manual_seed(3)
-    x = torch.rand(240, 1, generator=draw, dtype=torch.float64) * 4 - 2
-    y = torch.cat([x.sin(), -x], dim=1) + 0.05 * torch.randn(240, 2, generator=draw, dtype=torch.float64)
-    learner = getattr(network_peers, name)(1, 2)
-    before = learner.predict(x)
-    learner.update(x, y)
-    law = learner.predict(x, observation=True)
-    assert (learner(x) - y).square().mean() < 0.1 * y.square().mean()
-    assert ((law.mean - y).abs() < 2.0 * law.stddev).double().mean() > 0.8
-    assert (learner.predict(x).variance < before.variance).double().mean() > 0.9
-    learner.reset()
-    torch.testing.assert_close(learner.predict(x).mean, before.mean, atol=0, rtol=0)
-
-
-def test_low_rank_kalman_moves_by_its_gain() -> None:
-    from network_peers import LowRankKalman
-
-    draw = torch.Generator().manual_seed(5)
-    x = torch.rand(40, 2, generator=draw, dtype=torch.float64)
-    learner = LowRankKalman(2, 1)
-    learner.update(x, x.sum(-1, keepdim=True).sin())
-    learner._last_cov *= 1e-3  # the hidden weights decide
-    at, y = x[:1] + 0.3, torch.tensor([[1.2]], dtype=torch.float64)
-    latent, noisy = learner.predict(at), learner.predict(at, observation=True)
-    learner.update(at, y)
-    expected = latent.mean + latent.variance / noisy.variance * (y - latent.mean)
-    assert (expected - latent.mean).abs() > 5e-3
-    torch.testing.assert_close(learner(at) - latent.mean, expected - latent.mean, atol=0, rtol=0.05)
-
-
-def test_krls_tracker_without_forgetting_is_the_exact_gp() -> None:
-    from krls_tracker import KRLSTracker
-
-    draw = torch.Generator().manual_seed(18)
-    x, y = (torch.randn(30, n, dtype=torch.float64, generator=draw) for n in (4, 2))
-    kernel = SquaredExponential(4)
-    tracker = KRLSTracker(4, 2, capacity=40, kernel=kernel, noise_variance=0.05, standardize=False)
-    tracker.jitter = 1e-9
-    tracker.update(x, y)
-    K = kernel(x, x)
-    solved = torch.linalg.solve(K + 0.05 * torch.eye(30, dtype=torch.float64), torch.cat([y, K], dim=-1))
-    law = tracker.predict(x)
-    torch.testing.assert_close(law.mean, K @ solved[:, :2], atol=1e-6, rtol=0)
-    variance = (K - K @ solved[:, 2:]).diagonal()[:, None].expand(-1, 2)
-    torch.testing.assert_close(law.variance, variance, atol=1e-6, rtol=0)
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_krls_tracker_keeps_the_contract() -> None:
-    from krls_tracker import KRLSTracker
-
-    check_residual_learner(
-        lambda **options: KRLSTracker(3, 2, capacity=8, forgetting_factor=0.99, **options), n_samples=16
-    )

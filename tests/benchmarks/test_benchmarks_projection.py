@@ -13,9 +13,11 @@ pytest.importorskip("coal")
 
 from recorded_hand.projection import project_onto_contacts
 
+from torch_ekm.contact import constraint_matrix
 from torch_ekm.description import load_hand, load_object
-from torch_ekm.exceptions import EKMError, NoContactError, ParameterError, ShapeError, UnknownNameError
+from torch_ekm.exceptions import EKMError, UnknownNameError
 from torch_ekm.kinematics import GraspState
+from torch_ekm.kinematics.null_space import null_space
 from torch_ekm.model import KinematicModel
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # states of lists
@@ -23,29 +25,10 @@ F64, DEG = torch.float64, math.pi / 180
 NOISE = {"q_std": 2 * DEG, "position_std": 1e-3, "rotation_std": 2 * DEG}
 PINCH = {  # [deg]
     "icub_right": [
-        51.2,
-        19.2,
-        13.0,
-        50.2,
-        4.2,
-        12.2,
-        20.2,
-        39.8,
-        0,
-        19.1,
-        19.9,
-        38.8,
-        4.2,
-        0,
-        0,
-        0,
-        4.2,
-        0,
-        0,
-        0,
+        51.2, 19.2, 13.0, 50.2, 4.2, 12.2, 20.2, 39.8, 0, 19.1, 19.9, 38.8, 4.2, 0, 0, 0, 4.2, 0, 0, 0
     ],
     "planar_two_finger": [-18.8, 73.2, -17.4, 56.4],
-}
+}  # fmt: skip
 POSE = {
     "icub_right": (
         [0.0479, -0.0253, 0.0376],
@@ -90,12 +73,11 @@ def test_half_of_the_noisy_states_cannot_be_modelled_but_all_that_are_projected(
     raw, chi2, before, after = 0, [], [], []
     for state in noisy(hand, 60, 0):
         raw += fails(lambda state=state: model.linearize(state))
-        projection = project_onto_contacts(model, state, **NOISE)
+        projection = project_onto_contacts(model, state, **NOISE, touching=PADS[hand])
         assert projection.contacts.finger == PADS[hand]
         assert float(projection.contacts.gap.abs().max()) < 1e-6
         model.linearize(projection.state)
         model.linearize(projection.state, projection.contacts)
-        assert torch.allclose(state.plus(projection.change).q, projection.state.q)
         chi2.append(projection.chi2)
         before.append(state.minus(true)[: model.hand.n_q].norm())
         after.append(projection.state.minus(true)[: model.hand.n_q].norm())
@@ -109,42 +91,13 @@ def test_it_is_the_nearest_state_in_contact():
     model, _ = grasp("icub_right")
     std = torch.tensor([2 * DEG] * 20 + [1e-3] * 3 + [2 * DEG] * 3, dtype=F64)
     state = next(noisy("icub_right", 1, 3))
-    projection = project_onto_contacts(model, state, **NOISE)
+    projection = project_onto_contacts(model, state, **NOISE, touching=PADS["icub_right"])
+    change = projection.state.minus(state)
     kin = model.contact_kinematics(projection.state, projection.contacts)
-    from torch_ekm.contact import constraint_matrix
-    from torch_ekm.kinematics.null_space import null_space
-
     Z = model.reduction.basis
     A_n = constraint_matrix(kin)[kin.normal_rows]
     keep = Z @ null_space(A_n @ Z)
-    slope = keep.mT @ (projection.change / std**2)
-    assert slope.abs().max() < 0.02 * (keep.mT.abs() @ (projection.change.abs() / std**2)).max()
-
-
-def test_what_is_known_well_moves_little():
-    model, _ = grasp("icub_right")
-    state = next(noisy("icub_right", 1, 5))
-    sharp = project_onto_contacts(model, state, **(NOISE | {"q_std": 1e-5}))
-    assert sharp.change[:20].abs().max() < 1e-4
-    each = torch.full((20,), 2 * DEG, dtype=F64)
-    same = project_onto_contacts(model, state, **(NOISE | {"q_std": each, "position_std": [1e-3] * 3}))
-    assert torch.allclose(same.change, project_onto_contacts(model, state, **NOISE).change)
-
-
-def test_who_touches_is_told_by_fingertips_names_or_gaps():
-    model, true = grasp("icub_right")
-    away = true.plus(torch.cat([torch.zeros(20), 0.03 * model.contacts(true).normal[0], torch.zeros(3)]))
-    force = [1.0, 0.0, math.nan, 0.1, 0.0]  # the thumb alone
-    felt = project_onto_contacts(model, true, **NOISE, fingertip_force=force)
-    assert felt.contacts.finger[0] == "thumb"
-    named = project_onto_contacts(model, away, **NOISE, touching=["thumb"])
-    assert "thumb" in named.contacts.finger
-    assert abs(float(named.gap[0])) > 0.02
-    with pytest.raises(NoContactError):
-        project_onto_contacts(model, true, **NOISE, fingertip_force=[0.0] * 5)
+    slope = keep.mT @ (change / std**2)
+    assert slope.abs().max() < 0.02 * (keep.mT.abs() @ (change.abs() / std**2)).max()
     with pytest.raises(UnknownNameError, match="thumbs"):
-        project_onto_contacts(model, true, **NOISE, touching=["thumbs"])
-    with pytest.raises(ParameterError, match="q_std"):
-        project_onto_contacts(model, true, **(NOISE | {"q_std": 0.0}))
-    with pytest.raises(ShapeError, match="position_std"):
-        project_onto_contacts(model, true, **(NOISE | {"position_std": [1.0, 2.0]}))
+        project_onto_contacts(model, state, **NOISE, touching=["thumbs"])

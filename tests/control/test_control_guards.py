@@ -377,7 +377,7 @@ def test_guards_have_limits_of_their_own() -> None:
 
 
 def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> None:
-    """100 observations; 10000 with the simulated hand: ``benchmarks/simulated_hand/fuzz_loop.py``."""
+    """100 observations; 100,000 by ``benchmarks/gate.py``."""
     seen, axis, model = held
 
     def session(chance: float, observations: int) -> tuple[Obedient, ClosedLoop]:

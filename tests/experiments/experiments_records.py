@@ -32,6 +32,6 @@ def not_grasped(controller: str = "KM", seed: int = 0, **changes: Any) -> NotGra
     return NotGrasped(**{**about, "controller": controller, "seed": seed, "message": "too wide", **changes})
 
 
-def frame(records: Iterable[Record], limit: int = 40) -> pandas.DataFrame:
+def frame(records: Iterable[Record]) -> pandas.DataFrame:
     """These trials, of one job."""
-    return trial_frame({"job": records}, limit)
+    return trial_frame({"job": records})

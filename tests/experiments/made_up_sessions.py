@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 from experiments_records import turn
 
@@ -33,12 +31,6 @@ def made_up_online(protocol: Online, controller: str, seed: int) -> list[TrialRe
 
 
 def made_up_generalize(protocol: Generalize, item: str, controller: str, seed: int) -> list[TrialRecord]:
-    angles = enumerate(protocol.angles_of(item))
-    if controller == "new object":
-        turns = (made_up_turn("E-KM", seed, k, angle, item) for k, angle in angles)
-        return [dataclasses.replace(one, kind=controller) for one in turns]
-    records = [made_up_turn(controller, seed, k, angle, item) for k, angle in angles]
-    error = float(np.random.default_rng([seed, len(controller)]).uniform(0.2, 2.0))
-    dark = made_up_turn(controller, seed, 99, 12.0, item)
-    step = turn(controller, seed, error, kind="long step", angle_deg=5.0, object=item)
-    return [*records, step, dataclasses.replace(dark, kind="camera off")]
+    return [
+        made_up_turn(controller, seed, k, angle, item) for k, angle in enumerate(protocol.angles_of(item))
+    ]

@@ -1,4 +1,4 @@
-"""The paper's experiments, small: paired grasps, events, probes, settings, learners by name."""
+"""The paper's experiments, small: paired grasps, events, settings, learners by name."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from experiments_records import frame, not_grasped, turn
+from experiments_records import frame, not_grasped
 
 from torch_ekm.control import DEFAULT_TASKS, EffortTask, OneStep, Safety, StepBound, StoppingRule
 from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
-from torch_ekm.experiments import runner
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import LEARNERS, make_learner
 from torch_ekm.experiments.protocols.generalize import (
@@ -22,7 +21,6 @@ from torch_ekm.experiments.protocols.generalize import (
     SHARES,
     TABLE_I,
     Generalize,
-    new_object_table,
 )
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NotGrasped, TrialRecord
@@ -79,7 +77,7 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     one, both = (dataclasses.replace(base, objects=o).jobs((0,)) for o in (("box",), ("box", "can")))
     assert set(one) < set(both)  # more objects: what is there is used again
     assert set(dataclasses.replace(base, objects=("box",), controllers=("KM",)).jobs((0,))) < set(one)
-    assert len(both) == 2 * (len(CONTROLLERS) + 1)
+    assert len(both) == 2 * len(CONTROLLERS)
 
 
 def test_a_corrected_object_does_not_take_up_old_results(tmp_path: Path) -> None:
@@ -179,32 +177,20 @@ def test_knock_is_felt_in_its_trial_only(online: dict[str, list[TrialRecord]]) -
 def test_same_seed_same_session() -> None:
     protocol = Generalize(
         Setting(hand="planar_two_finger", engine="mujoco"), objects=("can",), angles_deg=(4.0,), warm_up=1,
-        long_step_deg=3.0, blind_deg=2.0, poses=True,
+        poses=True,
     )  # fmt: skip
     runs = [protocol.session("can", "E-KM", 1) for _ in range(2)]
     for ours, theirs in zip(*runs, strict=True):
         assert isinstance(ours, TrialRecord)
         assert isinstance(theirs, TrialRecord)
         assert dataclasses.replace(ours, seconds=()) == dataclasses.replace(theirs, seconds=())
-    assert [record.kind for record in runs[0]] == [
-        "warm-up", "turn", "long step", "long step", "camera off",
-    ]  # fmt: skip
-    _, turned, step, *_ = runs[0]
+    warm_up, turned = runs[0]
+    assert (warm_up.kind, turned.kind) == ("warm-up", "turn")
+    assert isinstance(warm_up, TrialRecord)
     assert isinstance(turned, TrialRecord)
-    assert isinstance(step, TrialRecord)
-    assert step.steps == 1
-    assert step.reason in ("step limit", "reached")
-    assert step.true_error_deg < 3.0
     assert turned.true_error_deg < 1.0
     assert len(turned.poses) == turned.steps + 1
-    assert step.poses == ()  # for pictures of turns only
-
-
-def test_a_long_step_of_a_true_model_ends_where_it_was_to() -> None:
-    bench = Bench(Setting(engine="mujoco", preset="none"), "box", "KM")
-    step = bench.long_step(0, 0, 5.0)
-    assert isinstance(step, TrialRecord)
-    assert step.true_error_deg < 0.3
+    assert warm_up.poses == ()  # for pictures of turns only
 
 
 def test_an_object_that_is_larger_than_described_is_held_and_not_modelled() -> None:
@@ -214,44 +200,6 @@ def test_an_object_that_is_larger_than_described_is_held_and_not_modelled() -> N
     assert isinstance(turned, TrialRecord)
     assert (turned.reason, turned.steps) == ("unstable grasp", 0)
     assert "check the object's size" in turned.message
-
-
-def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(runner, "_MOTIONS", 5)
-    protocol = Generalize(
-        Setting(hand="planar_two_finger", engine="mujoco"), objects=("can",), angles_deg=(4.0,)
-    )
-    name, job = list(protocol.jobs((3,)).items())[-1]
-    assert name.endswith("_new object_3")
-    grasps = []
-
-    class Noted(Bench):
-        def trial(self, *what, **options):
-            grasps.append((self.name, int(self.knowledge.figures.count), self.learner))
-            return super().trial(*what, **options)
-
-    monkeypatch.setattr(Generalize, "bench", Noted)
-    learned = protocol.session(*job)
-    assert [(one.object, one.kind) for one in learned][-1] == ("can", "new object")
-    assert {(one.object, one.kind) for one in learned[:-1]} == {("box", "first")}
-    assert sum(one.steps for one in learned[:-1] if isinstance(one, TrialRecord)) >= 5
-    (_, none, _), *_, (item, known, learner) = grasps
-    assert none == 0
-    assert (item, learner) == ("can", None)  # the object's own learner is empty
-    assert known >= 5
-
-
-def test_objects_with_and_without_warm_up_stand_side_by_side() -> None:
-    kinds = {"turn": (0.1, 0.3), "new object": (0.2, 0.4)}
-    trials = frame(
-        turn("E-KM", seed, kind=kind, true_error_deg=error, true_prediction_ekm_deg=(first, 9.0))
-        for seed in range(2)
-        for kind, (error, first) in kinds.items()
-    )
-    (row, _) = new_object_table(trials).text()
-    assert [cell.split(" ")[0] for cell in row[1:5]] == ["0.10", "0.20", "0.30", "0.40"]
-    assert row[-1] == "0, 0"
-    assert not new_object_table(trials[trials["kind"] == "turn"]).rows
 
 
 def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -267,7 +215,7 @@ def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(bench.plant, "reset", fail)
     assert isinstance(bench.trial(0, 0, 5.0), NotGrasped)
-    assert isinstance(bench.long_step(0, 0, 5.0), NotGrasped)
+    assert isinstance(bench.trial(0, 0, 5.0), NotGrasped)
     often = len(tried)
     again = bench.trial(0, 1, 5.0)
     assert (again.reason, again.message, again.trial) == ("not grasped", "too wide", 1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 import torch
-from link_weights import LinkWeights
 from model_icub import gripped
 from model_toys import F64, planar_two_finger, soft_two_finger, three_finger
 
@@ -117,22 +116,6 @@ def test_posture_stiffness_is_the_hessian_of_the_work_of_constant_forces():
     velocity = torch.linalg.cross(axis[None] * kin.upstream[..., None].to(F64), x[:, None] - origin[None])
     S = posture_stiffness(force, velocity, axis, precedes)
     assert torch.allclose(S, torch.func.hessian(work)(q), atol=1e-12)
-
-
-def test_the_weight_of_the_links_is_the_gradient_of_their_height():
-    model, _, at = gripped("box")
-    links = [link for link in model.hand.urdf.links if link.mass > 0]
-    gravity = torch.tensor(model.hand.gravity, dtype=F64)
-
-    def potential(q):
-        poses = model.kinematics(q)
-        places = [poses.of(link.name) @ torch.tensor([*link.com, 1.0], dtype=F64) for link in links]
-        return -sum(link.mass * gravity @ x[:3] for link, x in zip(links, places, strict=True))
-
-    gradient, hessian = LinkWeights(model.hand, model.kinematics)(model.kinematics(at.state.q))
-    assert torch.allclose(gradient, torch.func.grad(potential)(at.state.q), atol=1e-14)
-    assert torch.allclose(hessian, torch.func.hessian(potential)(at.state.q), atol=1e-14)
-    assert gradient.abs().max() > 1e-3
 
 
 def test_gravity_terms_are_derivatives_of_the_height():

@@ -51,7 +51,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_every_single_bit_counts(tmp_path: Path) -> None:
-    """400 of 400 by ``benchmarks/simulated_hand/kill_runs.py``; the same here with fewer."""
+    """Single bits, flipped one at a time, are all found."""
     folder = make(tmp_path)
     assert wrong(folder) == []
     whole = {name: content for name, content in contents(folder).items() if content}

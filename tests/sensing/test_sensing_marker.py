@@ -94,7 +94,7 @@ def test_covariance_is_carried_into_the_hand_frame(pose_of, mounted, which):
 
 
 def test_accuracy_at_nominal_noise():
-    """The stated limits, on a few frames; those of 1000 frames are in docs/benchmarks/sensing.md."""
+    """The stated limits, on a few frames; those of 1000 frames are in docs/benchmarks/simulation.md."""
     result = measure_tracking(24, seed=0)
     assert result.found == 1.0
     assert result.flips == 0

@@ -72,9 +72,9 @@ def reproduce(
     the same report. With 20 seeds, on two cores:
 
     \b
-    experiment  sessions  of                                       time
-    generalize       500  5 to 12 turns: 5 objects, 4 controllers  0.7 to 2 h
-    online            80  45 turns: 4 controllers                  0.5 to 1.5 h
+    experiment  sessions  of                                      time
+    generalize       400  5 to 8 turns: 5 objects, 4 controllers  0.5 to 1.5 h
+    online            80  45 turns: 4 controllers                 0.5 to 1.5 h
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """

@@ -1,4 +1,4 @@
-"""What the experiments share: hand, plant, model, learner and the rule by which all controllers stop."""
+"""Settings of experiments: hand, plant, model, learner and the rule by which all controllers stop."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Setting:
 
     @property
     def follows(self) -> bool:
-        """Whether f of the E-KM follows the figures of the hand. Motions of other figures than those of the
+        """f of the E-KM follows the figures of the hand. Motions of other figures than those of the
         forces let a grip slide where no pad measures."""
         return self.adapts and self.parameters.force_sensors
 

@@ -82,7 +82,7 @@ def run_jobs(
 
 @contextmanager
 def _named(job: str) -> Iterator[None]:
-    """What is raised here says in which job."""
+    """Errors that are raised here say in which job."""
     try:
         yield
     except Exception as error:
@@ -155,7 +155,7 @@ def _watching(parent: int) -> Callable[[], None]:
 
 
 def read_result(path: Path, name: str) -> Any:
-    """What the job of this name left in a file of :func:`run_jobs`.
+    """Read what the job of this name left in a file of :func:`run_jobs`.
 
     Raises:
         ValueError: the file is not, byte by byte, one that was written for this job.

@@ -164,5 +164,5 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
 
 
 def learner_figures(name: str, capacity: int, **options: Any) -> dict[str, Any]:
-    """What a learner is made with, defaults included, by one with one state and action."""
+    """List what a learner is made with, defaults included, by one with one state and action."""
     return describe(make_learner(name, 1, 1, capacity, **options))

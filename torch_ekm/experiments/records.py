@@ -1,4 +1,4 @@
-"""What came of a trial: typed figures, kept as JSON."""
+"""Records of trials: typed figures, kept as JSON."""
 
 from __future__ import annotations
 
@@ -25,13 +25,12 @@ _MOVING = 0.5 * _DEG  # commands that ask for less say nothing about the shortfa
 
 @dataclass(frozen=True)
 class Trial:
-    """What was to be done: object, controller, grasp and rotation."""
+    """A trial says what was to be done: object, controller, grasp and rotation."""
 
     object: str
     """Its name, or the stem of its file."""
     kind: str
-    """"turn", "warm-up", "first" (learning the hand), "new object", "long step" (one motion without feedback)
-    or "camera off" (at the end)."""
+    """"turn", or "warm-up", "first", "learning": those in which a learner or the hand is learned."""
     controller: str
     seed: int
     trial: int

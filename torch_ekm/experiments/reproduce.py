@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,9 @@ from .jobs import run_jobs
 from .protocols.generalize import Generalize
 from .protocols.online import Online
 from .protocols.protocol import Protocol
+from .records import TrialRecord
 from .reporting.report import Report
+from .reporting.statistics import DataFrame
 from .reporting.tables import why
 from .reporting.trials import trial_frame
 
@@ -93,10 +95,7 @@ def reproduce(
         processes, on_done: of :func:`~torch_ekm.experiments.jobs.run_jobs`.
     """
     protocol, seeds = experiment.protocol, experiment.seeds
-    kept = run_jobs(protocol.run, experiment.jobs, folder / "runs", processes, on_done)
-    read = protocol.record.from_json
-    results = {name: [read(figures) for figures in session] for name, session in kept.items()}
-    trials = trial_frame(results, protocol.setting.safety.rule.max_steps)
+    trials = run_trials(protocol, seeds, folder / "runs", processes, on_done)
     report = protocol.report(seeds, trials, folder)
     report.empty = not (trials["motions"] > 0).any()
     if report.empty:  # errors and ratios of turns that nobody made mean nothing
@@ -112,7 +111,22 @@ def reproduce(
         **protocol.setting.figures(),
     }
     report.write(folder)
+    trials.to_csv(folder / "trials.csv", index=False)
     return report
+
+
+def run_trials(
+    protocol: Protocol,
+    seeds: Sequence[int],
+    folder: Path,
+    processes: int = 1,
+    on_done: Callable[[str], None] | None = None,
+) -> DataFrame:
+    """The trials of all sessions; finished ones stay in ``folder``."""
+    kept = run_jobs(protocol.run, protocol.jobs(seeds), folder, processes, on_done)
+    read = TrialRecord.from_json
+    results = {name: [read(figures) for figures in session] for name, session in kept.items()}
+    return trial_frame(results)
 
 
 def objects_of(names: str | Path) -> tuple[str, ...]:

@@ -12,14 +12,11 @@ import numpy as np
 import torch
 
 from ..control import (
-    ActuatorLimit,
     ClosedLoop,
     FocusedPose,
     HandKnowledge,
-    LimitingFunction,
     LookAndMoveController,
     Manipulation,
-    OneStep,
     PoseTarget,
 )
 from ..description import ObjectDescription
@@ -34,7 +31,7 @@ from ..residual import ResidualLearner
 from ..simulation import DisturbedPlant, PlantChange, SimulatedHand, Tug
 from .config import Setting, object_name
 from .learners import DEFAULT_LEARNER, make_learner
-from .records import NotGrasped, Record, Trial, TrialRecord, true_state
+from .records import NotGrasped, Record, Trial, TrialRecord
 
 _DEG = math.pi / 180
 _TRIES = 4  # grasps drawn for one trial before it is given up
@@ -75,7 +72,7 @@ class Bench:
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
         adapts = self.learns and setting.follows
         self.knowledge = HandKnowledge.of(self.hand.hand, learns=inverse, adapts=adapts)
-        """Of the hand; it stays when the object changes."""
+        """It is that of the hand, and stays when the object changes."""
         self.model = KinematicModel(self.hand.hand, self.hand.object, setting.model)
         self.learner: ResidualLearner | None = None
         self.encoding: GraspEncoding | None = None
@@ -83,12 +80,12 @@ class Bench:
         self.no_grasp = ""
         """Why the last grasp that failed did."""
         self.last: Manipulation | None = None
-        """Of the last :meth:`turn`."""
+        """The last :meth:`turn` left it."""
         self._ever_held, self._failed = False, 0  # trials without a grasp
 
     @property
     def learns(self) -> bool:
-        """Whether the controller is an E-KM, which trains a learner after each motion."""
+        """The controller is an E-KM, which trains a learner after each motion."""
         return self.controller.startswith("E-KM")
 
     def grasp(self, seed: int, trial: int) -> GraspState | None:
@@ -171,37 +168,6 @@ class Bench:
             )
         self.last = _whole(self.closed_loop(plant, focus, learn=learn).run(target))
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
-
-    def long_step(self, seed: int, trial: int, step_deg: float) -> Record:
-        """One motion of ``step_deg`` from a fresh grasp: how far from it does the object come to rest?
-
-        Feedback has no say in it: the whole angle to the target is asked for, as measured, and no step is
-        cut. The true error is that of the rotation about the axis; the learner stays as it is.
-        """
-        start = self.grasp(seed, trial)
-        about = Trial(self.name, "long step", self.controller, seed, trial, step_deg)
-        if start is None:
-            return NotGrasped(**vars(about), message=self.no_grasp)
-        axis = self.hand.rotation_axis
-        setting, replace = self.setting, dataclasses.replace
-        limiting = LimitingFunction(gain=1.0, step=2 * step_deg * _DEG, contact_travel=None)
-        wide = ActuatorLimit(step=20 * _DEG)
-        limits = tuple(wide if isinstance(one, ActuatorLimit) else one for one in setting.limits)
-        controller = LookAndMoveController(
-            self._predictor, axis, setting.tasks, limits, limiting=limiting, bound=None
-        )
-        rule = replace(setting.safety.rule, max_steps=1, off_limit=math.inf)
-        safety = replace(setting.safety, rule=rule)
-        known = {"knowledge": self.knowledge, "safety": safety, "planner": OneStep()}
-        loop = ClosedLoop(self.plant, controller, **known, learn=False, decline=False)
-        done = _whole(loop.run(PoseTarget.turned(start, axis, step_deg * _DEG)))
-        asked, turned = step_deg, 0.0
-        if done.steps:  # the last one: before it some may have tightened the grip
-            asked = float(done.steps[-1].decision.desired) / _DEG
-            before, after = true_state(done.steps[-1].before), true_state(done.stop.final)
-            turned = float(after.minus(before)[-3:] @ axis) / _DEG
-        record = TrialRecord.of(about, done, axis, learns=self.learns)
-        return dataclasses.replace(record, true_error_deg=abs(turned - asked))
 
     def close(self) -> None:
         """Close the plant: its simulation and rendering end; the bench is not used afterwards."""

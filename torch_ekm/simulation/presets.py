@@ -51,7 +51,7 @@ _USED = {
     for k, name in enumerate(("nominal", "worn", "hostile"))
 }
 # "odd_1" to "odd_5": used hands that are of another kind than their description, mixtures of what others
-# than ours may be. Strengths are those of the families in docs/benchmarks/any_hand.md.
+# than ours may be. Strengths are those of the families in docs/benchmarks/objects.md.
 _ODD: tuple[dict[str, Any], ...] = (
     {"arm_variation": 0.25, "arm_phase": math.pi, "spring_stiffening": 0.5},
     {"arm_variation": 0.2, "arm_phase": math.pi, "spring_stiffening": -0.3, "hysteresis": 0.1},

@@ -1,4 +1,4 @@
-"""What a recording of one's own hand holds for a learner: which columns are state, command, observation."""
+"""Recordings of one's own hand for a learner: which columns are state, command, observation."""
 
 from __future__ import annotations
 

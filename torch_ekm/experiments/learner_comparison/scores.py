@@ -1,4 +1,4 @@
-"""What a comparison of learners says in numbers, and how sure it is."""
+"""Scores of a comparison of learners, and how sure they are."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Score:
     microseconds: float
     """One prediction with deviation and one update."""
     kilobytes: float
-    """Of the state dict."""
+    """Its state dict takes so much."""
     of_outputs: Mapping[Measure, Sequence[float]] = field(default_factory=dict)
     """rms error, and median of the absolute errors, of each output in the stream's units."""
 
@@ -58,7 +58,7 @@ class Comparison:
     """(stream, learner) -> squared error of each scored sample, mean over the outputs."""
 
     def measure(self, stream: str) -> Measure:
-        """What the learners are ranked by: rms errors, or medians where few samples make the rms.
+        """Learners are ranked by rms errors, or by medians where few samples make the rms.
 
         That is where a hundredth of the samples makes more than half of the squared error of the learner
         with the smallest.
@@ -158,7 +158,7 @@ class Comparison:
         return sentences
 
     def _in_file_units(self, stream: Stream, best: str) -> str:
-        """What the best learner makes of the model's errors, where a sentence can hold it."""
+        """Say what the best learner makes of the model's errors, where a sentence can hold it."""
         if best == "model alone" or not 0 < len(stream.outputs) <= _NAMED:
             return ""
         measure, errors = self.measure(stream.name), self.output_errors(stream.name, best)

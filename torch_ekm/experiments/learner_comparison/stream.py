@@ -1,4 +1,4 @@
-"""What learners are compared on: samples in the order of time, in units of their own beginning."""
+"""Streams, on which learners are compared: samples in the order of time, in units of their beginning."""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from .generalize import Generalize
 
 @dataclass(frozen=True)
 class Demo(Generalize):
-    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, without the probes
-    and with pictures.
+    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and
+    with pictures.
 
     Raises:
         UnknownNameError: no such object; the message lists them.
@@ -34,11 +34,8 @@ class Demo(Generalize):
 
     objects: tuple[str, ...] = ("box",)
     warm_up: int = 0
-    long_step_deg: float = 0.0
-    blind_deg: float = 0.0
     controllers: tuple[str, ...] = ("KM", "E-KM")
     poses: bool = True
-    new_objects: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -54,11 +51,11 @@ class Demo(Generalize):
         return dataclasses.replace(self, angles_deg=self.angles_of(self.object)[:2])
 
     def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
-        """That of the turns, each target on its own, the motions, and pictures."""
+        """Report the turns, each target on its own, the motions, and pictures."""
         report, turns = super().report(seeds, trials, folder), select(trials)
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
-        shown = ("stop_reasons", "controllers", "motions", "comparison", "prediction")
+        shown = ("stop_reasons", "controllers", "prediction")
         report.tables = [self.angle_table(turns)] + [t for t in report.tables if t.name in shown]
         report.leading = 1
         report.figures = [*self._pictures(turns, folder), *self._motions(turns, folder), *report.figures]

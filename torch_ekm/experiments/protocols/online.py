@@ -27,7 +27,7 @@ _LEARNED = 16
 _KNOCK = (0.0, 0.10, 0.0)
 """Torque of a knock [N m], hand frame, for 50 ms: it turns the tube by 5 to 10 deg."""
 _NEW_TENDONS = {"moment_arm": 1.15, "servo_stiffness": 0.8}
-"""What the plant then is: tighter tendons, less stretch."""
+"""The plant then has tighter tendons, and less stretch."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,7 @@ class Online(Protocol):
     """In these trials the object is knocked after its third motion."""
     tendons_replaced: int = 31
     """Before this trial the tendons are replaced (0: never)."""
+    controllers: tuple[str, ...] = CONTROLLERS
 
     def __post_init__(self) -> None:
         low, high = self.angle_range_deg
@@ -74,8 +75,9 @@ class Online(Protocol):
 
     def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, int]]:
         """One for each seed and controller: all trials in order."""
-        stem = f"online_{digest(self.setting, (self.object,), self)}"
-        return {f"{stem}_{name}_{seed}": (name, seed) for seed in seeds for name in CONTROLLERS}
+        alone = dataclasses.replace(self, controllers=CONTROLLERS)  # a job does not depend on the others
+        stem = f"online_{digest(self.setting, (self.object,), alone)}"
+        return {f"{stem}_{name}_{seed}": (name, seed) for seed in seeds for name in self.controllers}
 
     def session(self, controller: str, seed: int) -> list[Record]:
         """All trials of one seed, in order."""
@@ -118,8 +120,6 @@ class Online(Protocol):
             self.learning_table(trials),
             tables.prediction_table(trials),
             tables.controller_table(trials),
-            tables.motion_table(trials),
-            tables.comparison_table(trials),
         ]
         what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."
         if len(seeds) >= LEAST_SEEDS:

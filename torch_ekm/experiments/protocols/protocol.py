@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from ..config import Setting
-from ..records import Record, TrialRecord
+from ..records import Record
 from ..reporting.report import Report
 from ..reporting.statistics import DataFrame
 
@@ -19,8 +19,6 @@ class Protocol(ABC):
     """
 
     setting: Setting
-    record: ClassVar[type[TrialRecord]] = TrialRecord
-    """What a session leaves of each grasped object."""
     quick_seeds: ClassVar[int] = 2
     """As many show that it works."""
 
@@ -46,5 +44,5 @@ class Protocol(ABC):
         """
 
     def run(self, *arguments: Any) -> list[dict[str, Any]]:
-        """What :meth:`session` leaves, in terms that JSON can keep."""
+        """Run :meth:`session`; its records in terms that JSON can keep."""
         return [record.to_json() for record in self.session(*arguments)]

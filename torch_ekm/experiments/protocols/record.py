@@ -41,7 +41,7 @@ class RecordConfig:
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """What decides the trials, for the log."""
+        """All that decides the trials, for the log."""
         figures = dataclasses.asdict(self)
         plant = self.setting.plant_config(self.controller)
         parameters = dataclasses.asdict(self.setting.parameters)

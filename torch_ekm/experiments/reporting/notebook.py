@@ -1,4 +1,4 @@
-"""What the notebooks share: smoke mode, pictures of the hand, and copies of them."""
+"""Smoke mode, pictures of the hand, and copies of notebooks, which the notebooks share."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def hand_picture(scene: Scene, frames: tuple[int, ...] = (0,)) -> Any:
 
 
 def notebook_folder() -> Path:
-    """Where the notebooks lie: in the installed package, or in the checkout.
+    """Find the notebooks: in the installed package, or in the checkout.
 
     Raises:
         DescriptionError: in neither.

@@ -126,7 +126,7 @@ def plot_steady_state_error(turns: DataFrame) -> Figure:
 
 
 def _draw_errors(axis: Any, turns: DataFrame, controllers: list[str]) -> None:
-    """Those of one object."""
+    """Draw the errors of one object."""
     top, targets = _top(turns), sorted(turns["angle_deg"].unique())
     width = 0.8 / len(controllers)
     for (name, target), errors in turns.groupby(["controller", "angle_deg"], sort=False)["error_deg"]:
@@ -152,7 +152,7 @@ def _top(turns: DataFrame) -> float:
 
 
 def crosses_caption(turns: DataFrame) -> str:
-    """What the crosses in :func:`plot_steady_state_error` are; "": there are none."""
+    """Say what the crosses in :func:`plot_steady_state_error` are; "": there are none."""
     beyond = sum(int((mine["error_deg"] > _top(mine)).sum()) for _, mine in turns.groupby("object"))
     return f" Crosses at the upper edge: {beyond} turn{'' if beyond == 1 else 's'} above." if beyond else ""
 

@@ -33,7 +33,7 @@ class Column:
 
     name: str
     spec: str = ".2f"
-    """Of real numbers and estimates, as in ``format(x, spec)``."""
+    """It formats real numbers and estimates, as in ``format(x, spec)``."""
     percent: bool = False
     """The cells are shares, written in percent."""
 
@@ -118,7 +118,7 @@ class FigureFile:
 
 @dataclass
 class Report:
-    """What a run has to show.
+    """A report shows what came of a run.
 
     ``write`` leaves ``index.html``, the same as ``report.md``, one CSV for each table, ``report.json`` with
     the texts, and ``configuration.json`` with the exact configuration, versions and seeds. On the page the
@@ -134,7 +134,7 @@ class Report:
     leading: int = 1
     """So many of the first tables are not folded."""
     legend: Mapping[str, str] = field(default_factory=dict)
-    """What is compared: name -> one line."""
+    """A line for each name that is compared."""
     empty: bool = False
     """Nothing was measured: the summary says why, and a command ends with 1."""
 

@@ -1,4 +1,4 @@
-"""What the reports of several protocols share: tables of the controllers, and sentences."""
+"""Tables of the controllers and sentences, which the reports of several protocols share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..records import NotGrasped
 from . import statistics as stats
 from .report import Cell, Column, Table
 from .statistics import LEAST_SEEDS, DataFrame, Estimate
-from .trials import BAND_DEG, STEP_DEG, select
+from .trials import select
 
 _REACHED = StopReason.REACHED.value
 #: What each controller is, in a line.
@@ -52,7 +52,7 @@ def by_object(trials: DataFrame) -> dict[str, DataFrame]:
 
 
 def legend(trials: DataFrame) -> dict[str, str]:
-    """What the controllers are that took part."""
+    """Say what the controllers are that took part."""
     there = set(trials["controller"])
     return {name: line for name, line in LEGEND.items() if name in there}
 
@@ -61,41 +61,20 @@ def controller_table(trials: DataFrame) -> Table:
     """How the turns of every controller ended, on the same seeds and grasps."""
     columns: dict[Column, Callable[[DataFrame], Cell]] = {
         Column("steady-state error [deg]"): lambda mine: stats.estimate(mine, "error_deg"),
-        Column("survivors [deg]"): lambda mine: stats.estimate(mine, "survivor_error_deg"),
-        Column("median [deg]"): lambda mine: float(mine["error_deg"].median()),
+        Column("motions", ".1f"): lambda mine: stats.estimate(mine, "motions"),
+        Column("first motion [deg]"): lambda mine: stats.estimate(mine, "first_step_deg"),
         Column("reached"): lambda mine: stats.rate(mine["reason"] == _REACHED),
         Column("not reached"): lambda mine: stats.rate(mine["not_reached"]),
         Column("lost"): lambda mine: stats.rate(mine["lost"]),
     }
     note = (
         "Mean and 95 % bootstrap interval over pairs of object and seed; steady-state errors by the "
-        "simulation's truth. A lost object counts with the whole angle of the target; 'survivors' "
-        "leaves it out. Not reached: the object is in the hand, but not at its target. Intervals of "
-        "rates are Wilson's."
+        "simulation's truth. A lost object counts with the whole angle of the target. First motion: by how "
+        "much more or less it changed the error than it was to. Not reached: the object is in the hand, but "
+        "not at its target. Intervals of rates are Wilson's."
     )
     items = by_controller(trials)
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
-
-
-def motion_table(trials: DataFrame) -> Table:
-    """What the motions of every controller were worth."""
-    columns: dict[Column, Callable[[DataFrame], Cell]] = {
-        Column("motions", ".1f"): lambda mine: stats.estimate(mine, "motions"),
-        Column("beyond angle / step", ".1f"): lambda mine: stats.estimate(mine, "beyond"),
-        Column("first motion [deg]"): lambda mine: stats.estimate(mine, "first_step_deg"),
-        Column("all motions [deg]"): lambda mine: stats.estimate(mine, "step_error_deg"),
-        Column("off the axis [deg]", ".1f"): lambda mine: stats.estimate(mine, "survivor_off_deg"),
-    }
-    note = (
-        "Mean and 95 % bootstrap interval over pairs of object and seed. Beyond angle / step: motions until "
-        f"the measured error stays within {BAND_DEG:g} deg, less the angle over {STEP_DEG:g} deg, rounded "
-        "up; below 0 where one movement is longer. A turn that never settles counts with the limit. First "
-        "motion, all motions (that ask for 0.5 deg or more): by how much more or less a "
-        "motion changed the error than it was to. Off the axis: rotation at the end, of objects that were "
-        "not lost."
-    )
-    items = by_controller(trials)
-    return Table.of("motions", "The motions of each controller", "controller", items, columns, note)
 
 
 def reason_table(trials: DataFrame) -> Table:
@@ -114,34 +93,6 @@ def reason_table(trials: DataFrame) -> Table:
     columns = ["reason", *(f"{name}: turns (error [deg])" for name in names), "what it means"]
     note = "Turns, and in brackets the mean true error at their end; none of lost objects."
     return Table("stop_reasons", "Why the turns ended", columns, rows, note)
-
-
-def comparison_table(trials: DataFrame) -> Table:
-    """E-KM against the other controllers in everything that is measured."""
-    values = {
-        "steady-state error": ("turn", "error_deg"),
-        "motions to settle": ("turn", "settle"),
-        "error of the first motion": ("turn", "first_step_deg"),
-        "error of a motion": ("turn", "step_error_deg"),
-        "rotation off the axis": ("turn", "survivor_off_deg"),
-        "error of one long step": ("long step", "error_deg"),
-        "steady-state error, camera off": ("camera off", "error_deg"),
-    }
-    n_seeds, kinds, there = trials["seed"].nunique(), {"turn", *trials["kind"]}, {*trials["controller"]}
-    others = [name for name in CONTROLLERS if name != "E-KM" and there.issuperset(("E-KM", name))]
-    rows: list[list[Cell]] = []
-    for what, (kind, column) in values.items():
-        if kind in kinds:
-            pairs = (paired(trials, "E-KM", name, column, kind) for name in others)
-            rows.append([what, *(cell for pair in pairs for cell in ratio_and_p(*pair, n_seeds))])
-    columns: list[Column | str] = ["ratio of"]
-    for pair in (f"E-KM : {name}" for name in others):
-        columns += [Column(f"{pair} [%]", ".0f", percent=True), Column(f"p, {pair}", ".1g")]
-    note = (
-        "Ratio of means over the same objects and seeds, 95 % bootstrap over pairs, p of the paired t-test "
-        f"(none with fewer than {LEAST_SEEDS} seeds)."
-    )
-    return Table("comparison", "Paired ratios", columns, rows, note)
 
 
 def paired(trials: DataFrame, ours: str, theirs: str, column: str, kind: str = "turn") -> tuple[Array, Array]:
@@ -239,7 +190,7 @@ def why(turns: DataFrame) -> str:
 
 
 def warmed_up(turns: int) -> str:
-    """What the E-KM does before it is measured."""
+    """Say what the E-KM does before it is measured."""
     before = f" The E-KM makes {_counted(turns, 'turn')} with each object and seed before those that count."
     return before if turns else ""
 

@@ -10,25 +10,18 @@ from typing import Any
 import numpy as np
 
 from ..._extras import require
-from ...control import LimitingFunction
-from ...control.qp import DEGREE
 from ..records import Record, TrialRecord
 from .statistics import DataFrame
 
-#: An error is settled when it stays within twice the default tolerance [deg].
-BAND_DEG = 0.5
-#: Largest step without a plan [deg].
-STEP_DEG = LimitingFunction().step / DEGREE
-
 #: What :func:`trial_frame` adds to the figures of a record; NaN where nothing was grasped.
 _ADDED = (
-    "error_deg", "survivor_error_deg", "survivor_off_deg", "motions", "settle", "beyond",
+    "error_deg", "survivor_error_deg", "survivor_off_deg", "motions",
     "prediction_km", "prediction_ekm", "true_prediction_km", "true_prediction_ekm",
 )  # fmt: skip
 _COLUMNS = ("job", "grasped", *(field.name for field in dataclasses.fields(TrialRecord)), *_ADDED)
 
 
-def trial_frame(results: Mapping[str, Iterable[Record]], limit: int) -> DataFrame:
+def trial_frame(results: Mapping[str, Iterable[Record]]) -> DataFrame:
     """The trials of all jobs, one row each.
 
     Columns are the figures of the record and
@@ -40,14 +33,11 @@ def trial_frame(results: Mapping[str, Iterable[Record]], limit: int) -> DataFram
     survivor_error_deg      the same, of objects that were not lost
     survivor_off_deg        rotation off the axis at the end, of objects that were not lost
     motions                 their number
-    settle                  motions until the measured error stays within 0.5 deg; ``limit`` if it never does
-    beyond                  the same less the least possible, ``ceil(angle / step)``
     prediction_km, ...      mean over the motions of ``prediction_km_deg``, ...; NaN where there is none
     ======================  ===============================================================================
 
     Args:
         results: job -> its records.
-        limit: largest number of motions.
     """
     rows = [
         {
@@ -55,7 +45,7 @@ def trial_frame(results: Mapping[str, Iterable[Record]], limit: int) -> DataFram
             "grasped": record.grasped,
             "reason": record.reason,
             **vars(record),
-            **_added(record, limit),
+            **_added(record),
         }
         for job, records in results.items()
         for record in records
@@ -72,13 +62,10 @@ def select(trials: DataFrame, **wanted: Any) -> DataFrame:
     return trials[chosen]
 
 
-def _added(record: Record, limit: int) -> dict[str, Any]:
+def _added(record: Record) -> dict[str, Any]:
     if not isinstance(record, TrialRecord):
         return {"lost": False, "not_reached": False}
     lost, angle = record.lost, abs(record.angle_deg)
-    outside = np.flatnonzero(np.asarray(record.errors_deg) > BAND_DEG)
-    settled = int(outside[-1]) + 1 if outside.size else 0
-    settle = limit if lost or settled >= len(record.errors_deg) else settled
     names = [name for name in _ADDED if "prediction" in name]
     made = {name: getattr(record, f"{name}_deg") for name in names}
     return {
@@ -88,7 +75,5 @@ def _added(record: Record, limit: int) -> dict[str, Any]:
         "survivor_error_deg": math.nan if lost else record.true_error_deg,
         "survivor_off_deg": math.nan if lost else record.off_rotation_deg,
         "motions": record.steps,
-        "settle": settle,
-        "beyond": settle - math.ceil(angle / STEP_DEG - 1e-9),
         **{name: float(np.mean(errors)) if errors else math.nan for name, errors in made.items()},
     }

@@ -1,0 +1,374 @@
+"""Trials of simulated hands as one matrix: plant x object x controller x variant, one frame, a row a trial.
+
+    python benchmarks/matrix.py hands --objects box,bottle --seeds 1000:1010 --out FOLDER
+    python benchmarks/matrix.py --list
+
+A question names plants, objects and contenders, what a session does, and the table and picture that answer
+it, which are queries of the frame. The frame is left in ``--out`` as trials.csv. Finished sessions stay
+there, too: an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas
+from contenders import Contender
+from hands import CONDITIONS, Hand, hands
+
+from torch_ekm._terminal import progress
+from torch_ekm.cli._app import parse_seeds
+from torch_ekm.experiments.config import Setting, digest, object_name
+from torch_ekm.experiments.jobs import run_jobs
+from torch_ekm.experiments.records import TrialRecord
+from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
+from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.reporting.trials import trial_frame
+from torch_ekm.simulation import ENGINES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Frame = Any  # pandas has no types
+EARLY = 5  # motions with an object
+_INTERVAL = 1.645  # standard deviations: 90 %
+_PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#7f7f7f", "#F0E442")
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked of the matrix."""
+
+    title: str
+    session: Callable[..., list[dict[str, Any]]]
+    contenders: Mapping[str, Contender]
+    hands: str = "nominal"
+    """Names of :func:`hands.hands`."""
+    objects: str = "box,can"
+    engine: str = "mujoco"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of the session."""
+    together: bool = False
+    """A session has all objects, in their order; else one."""
+    setting: Mapping[str, Any] = field(default_factory=dict)
+    """Changes of every hand's setting."""
+    plant: Mapping[str, Any] = field(default_factory=dict)
+    """Figures of every plant."""
+    by: str = "contender"
+    """Column of the frame: a row of the table for each."""
+    columns: tuple[str, ...] = ("turns", "lost", "reached", "motions", "error [deg]")
+    """Names of :data:`FIGURES`."""
+    kind: str = "turn"
+    """The trials that count."""
+    split: str = "plant"
+    """Column of the second table, which has a row for each of its entries."""
+    more: tuple[Callable[[Frame], Table], ...] = ()
+    """Further tables."""
+    picture: Callable[[Frame], Figure] | None = None
+    """None: ends and motions of the groups of ``split``."""
+    quick: Mapping[str, Any] = field(default_factory=dict)
+    """Arguments of the session that make it short."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A figure that tables can state of some trials."""
+
+    of: Callable[[Frame], Cell]
+    spec: str = ".2f"
+
+
+def _reached(turns: Frame) -> Frame:
+    return turns[~turns["lost"] & ~turns["not_reached"]]
+
+
+def _mean(values: Any) -> float:
+    known = [value for value in values if value is not None and not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _median(values: Any) -> float:
+    known = [value for value in values if value is not None and not math.isnan(value)]
+    return float(np.median(known)) if known else math.nan
+
+
+def early(turns: Frame, which: str) -> list[float]:
+    """One-step errors of the first motions of each hand with each object [deg].
+
+    Args:
+        which: "km" or "ekm".
+    """
+    found: list[float] = []
+    for _, mine in turns.groupby(["plant", "contender", "object", "seed"]):
+        every = itertools.chain.from_iterable(mine[f"true_prediction_{which}_deg"])
+        found += itertools.islice(every, EARLY)
+    return found
+
+
+def other_ends(turns: Frame) -> str:
+    """How those ended that did not reach the target, the most frequent first."""
+    missed = turns[turns["lost"] | turns["not_reached"]]["reason"].value_counts()
+    return ", ".join(f"{n} {reason}" for reason, n in missed.items())
+
+
+#: What tables can say of some trials.
+FIGURES: dict[str, Measure] = {
+    "turns": Measure(len),
+    "lost": Measure(lambda t: int(t["lost"].sum())),
+    "reached": Measure(lambda t: len(_reached(t))),
+    "motions": Measure(lambda t: _mean(_reached(t)["motions"]), ".1f"),
+    "turning movements": Measure(lambda t: _mean(_reached(t)["turning"]), ".1f"),
+    "seconds": Measure(lambda t: _mean(_reached(t)["simulated_s"]), ".1f"),
+    "error [deg]": Measure(lambda t: _mean(t["error_deg"])),
+    "off the axis, largest [deg]": Measure(lambda t: float(t["survivor_off_deg"].max()), ".1f"),
+    "first motion [deg]": Measure(lambda t: _mean(t["first_step_deg"])),
+    "KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "km"))),
+    "E-KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "ekm"))),
+    "predicted by the KM [deg]": Measure(lambda t: _mean(t["true_prediction_km"])),
+    "by the E-KM [deg]": Measure(lambda t: _mean(t["true_prediction_ekm"])),
+    "joints off by [deg]": Measure(lambda t: _mean(t["joints"])),
+    "motors off by [deg]": Measure(lambda t: _mean(t["motors"])),
+    "other ends": Measure(other_ends),
+    "declined": Measure(lambda t: int((t["reason"] == "out of reach").sum())),
+    "within": Measure(lambda t: int((t["size"] <= 1).sum())),
+    "turn [deg]": Measure(lambda t: _median(t["wrong_deg"])),
+    "shift [mm]": Measure(lambda t: _median(t["wrong_mm"])),
+    "farthest [deg]": Measure(lambda t: _median(t["largest"]), ".1f"),
+    "predicted end off by [deg]": Measure(lambda t: _median((t["reach"] - t["largest"]).abs()), ".1f"),
+    "estimate off by [deg]": Measure(lambda t: _median(t["estimate"].where(t["part"].str[:5] == "blind"))),
+    "stated sd [deg]": Measure(lambda t: _median(t["sd"])),
+    "along the grip, last [mm]": Measure(lambda t: _mean(_last(t)["shift"])),
+    "contacts slid, last [mm]": Measure(lambda t: _mean(_last(t)["slid"])),
+}  # fmt: skip
+
+
+def _last(turns: Frame) -> Frame:
+    """The last return of each series."""
+    back = turns[(turns["part"] == "series") & turns["back"].eq(True)]
+    return back.groupby(["plant", "contender", "object", "seed"]).tail(1)
+
+
+def frame_of(
+    results: Mapping[str, Sequence[Mapping[str, Any]]], keys: Mapping[str, tuple[str, str]]
+) -> Frame:
+    """A row for each trial with a grasp: figures of the record and of the session, plant and contender.
+
+    Args:
+        results: what sessions left, by job.
+        keys: plant and contender of each job.
+    """
+    rows = [(job, one) for job, session in results.items() for one in session]
+    records = {str(k): [TrialRecord.from_json(one["record"])] for k, (_, one) in enumerate(rows)}
+    trials = trial_frame(records)
+    more = pandas.DataFrame([{k: v for k, v in one.items() if k != "record"} for _, one in rows])
+    plant, contender = zip(*(keys[job] for job, _ in rows), strict=True)
+    found = pandas.concat([trials, more, pandas.DataFrame({"plant": plant, "contender": contender})], axis=1)
+    if "part" in found:
+        found["case"] = found["contender"] + ", " + found["part"]
+    return found[found["grasped"].astype(bool)].reset_index(drop=True)
+
+
+def table(turns: Frame, by: str, columns: Sequence[str], name: str, title: str, note: str = "") -> Table:
+    """A row for each entry of a column."""
+    items = {str(key): mine for key, mine in turns.groupby(by, sort=False)}
+    cells = {Column(column, FIGURES[column].spec): FIGURES[column].of for column in columns}
+    return Table.of(name, title, by, items, cells, note)
+
+
+def pivot(turns: Frame, by: str, split: str) -> Table:
+    """Lost, reached, motions: a row for each entry of ``split``, a column for each of ``by``."""
+    names = list(dict.fromkeys(turns[by]))
+    rows: list[list[Cell]] = []
+    for key, mine in turns.groupby(split, sort=False):
+        groups = dict(tuple(mine.groupby(by)))
+        cells = (
+            f"{int(one['lost'].sum())}, {len(_reached(one))}, {_mean(_reached(one)['motions']):.1f}"
+            if (one := groups.get(name)) is not None
+            else "-"
+            for name in names
+        )
+        rows.append([str(key), len(mine), *cells])
+    note = "Lost, reached, and mean motions of the turns that reached the target."
+    return Table(f"by_{split}", f"Each {split}", [split, "turns", *names], rows, note)
+
+
+def ends_picture(turns: Frame, by: str, split: str) -> Figure:
+    """Turns lost and not reached, and motions, for each group."""
+    names, groups = list(dict.fromkeys(turns[by])), list(dict.fromkeys(turns[split]))
+    figure, (ends, motions) = new_figure(8.5, 0.28 * len(groups) + 1.4, 2, 1, sharey=True)
+    for k, name in enumerate(names):
+        colour = COLOURS.get(name, _PALETTE[k % len(_PALETTE)])
+        for i, group in enumerate(groups):
+            mine = turns[(turns[by] == name) & (turns[split] == group)]
+            at, n = i + 0.7 * ((k + 0.5) / len(names) - 0.5), max(len(mine), 1)
+            lost, missed = (100 * mine[column].sum() / n for column in ("lost", "not_reached"))
+            ends.barh(at, lost, 0.6 / len(names), color=colour)
+            ends.barh(at, missed, 0.6 / len(names), left=lost, color=colour, alpha=0.35)
+            label = name if i == 0 else None
+            motions.plot(_mean(_reached(mine)["motions"]), at, "o", ms=4, color=colour, label=label)
+    ends.set_yticks(range(len(groups)), [str(group).replace("_", " ") for group in groups], fontsize=8)
+    ends.set_ylim(len(groups) - 0.4, -0.6)
+    ends.set(xlabel="turns lost, pale: not reached [%]", xlim=(0, 100))
+    motions.set(xlabel="motions of a turn that reached the target", xlim=(0, None))
+    figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=8)
+    return figure
+
+
+def learning_picture(turns: Frame) -> Figure:
+    """One-step error against the number of motions with an object, means over hands and objects."""
+    figure, (axes,) = new_figure(6.0, 3.2)
+    first = turns["contender"].iloc[0]
+    curves = [("KM", first, "km"), *((name, name, "ekm") for name in dict.fromkeys(turns["contender"]))]
+    for k, (label, name, which) in enumerate(curves):
+        mine, column = turns[turns["contender"] == name], f"true_prediction_{which}_deg"
+        groups = mine.groupby(["plant", "object", "seed"])[column]
+        errors = [list(itertools.chain.from_iterable(one)) for _, one in groups]
+        means = [_mean([one[j] for one in errors if len(one) > j]) for j in range(25)]
+        colour = COLOURS["KM"] if label == "KM" else _PALETTE[(k - 1) % len(_PALETTE)]
+        axes.plot(range(1, len(means) + 1), means, "o-", ms=3, color=colour, label=label)
+    axes.set(xlabel="motion with a new object", ylabel="one-step error [deg]", ylim=(0, None))
+    axes.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def bands_table(turns: Frame) -> Table:
+    """How often what was measured after a planned movement is in its stated 90 % interval."""
+
+    def held(deviations: Any) -> Cell:
+        found = [abs(z) < _INTERVAL for z in deviations]
+        return f"{100 * np.mean(found):.0f} % of {len(found)}" if found else None
+
+    items = {
+        str(key): found
+        for key, mine in turns.groupby("contender", sort=False)
+        if (found := list(itertools.chain.from_iterable(mine["bands"])))
+    }
+    columns: dict[Column, Callable[[list[Any]], Cell]] = {
+        Column("movements"): len,
+        Column("about the axis"): lambda found: held(band[1] for band in found),
+        Column("off the axis"): lambda found: held(band[2] for band in found),
+        Column("normal forces"): lambda found: held(z for band in found for z in band[3]),
+    }
+    note = "Share of what was measured after a planned movement that is in its stated 90 % interval."
+    return Table.of("bands", "Bands of the plans", "contender", items, columns, note)
+
+
+def verdict(turns: Frame, by: str) -> str:
+    """The last line: what came of each group."""
+
+    def told(mine: Frame) -> str:
+        names = ("lost", "reached", "turning movements", "motions", "seconds")
+        lost, reached, *means = (FIGURES[name].of(mine) for name in names)
+        turning, motions, seconds = (Column("", ".1f").text(one) for one in means)
+        counts = f"lost {lost} of {len(mine)}, reached {reached}, turning movements {turning}"
+        return f"{counts}, all motions {motions}, seconds {seconds}"
+
+    return "; ".join(f"{name} {told(mine)}" for name, mine in turns.groupby(by, sort=False))
+
+
+def session(
+    make: Callable[..., Any], one: Contender, setting: Setting, items: Sequence[str], seed: int, options: Any
+) -> list[dict[str, Any]]:
+    """What one job leaves."""
+    own = one.setting(setting).hardware_instance(seed)
+    return make(lambda item: one.bench(own, item, one.controller), items, seed, **options)
+
+
+def jobs(
+    asked: Question, found: Mapping[str, Hand], names: Sequence[str], items: Sequence[str],
+    seeds: Sequence[int], engine: str, quick: bool,
+) -> tuple[dict[str, tuple[Any, ...]], dict[str, tuple[str, str]]]:  # fmt: skip
+    """Job -> arguments of :func:`session`, and its plant and contender. A name has all that decides it."""
+    todo, keys = {}, {}
+    options = {**asked.options, **(asked.quick if quick else {})}
+    groups = [tuple(items)] if asked.together else [(item,) for item in items]
+    for plant, seed, group, name in itertools.product(found, seeds, groups, names):
+        setting = Setting(engine=engine).replace(**{**asked.setting, **found[plant]})
+        setting = setting.replace(plant=setting.parameters.replace(**asked.plant))
+        setting = setting.replace(sensing=False) if quick else setting
+        one = asked.contenders[name]
+        decides = digest(
+            one.setting(setting), group, options, one.bench, one.controller, asked.session.__name__
+        )
+        job = "_".join([plant, *map(object_name, group), name, decides, str(seed)])
+        job = "".join(c if c.isalnum() or c in "_-.+" else "_" for c in job)
+        todo[job], keys[job] = (asked.session, one, setting, group, seed, options), (plant, name)
+    return todo, keys
+
+
+def report(asked: Question, turns: Frame, folder: Path, name: str) -> Report:
+    """Tables, picture and verdict, in ``folder``."""
+    turns.to_csv(folder / "trials.csv", index=False)
+    counted = turns[turns["kind"] == asked.kind] if asked.kind else turns
+    told = verdict(counted, asked.by)
+    tables = [table(counted, asked.by, asked.columns, name, asked.title)]
+    if counted[asked.split].nunique() > 1 and asked.split != asked.by:
+        tables.append(pivot(counted, asked.by, asked.split))
+    tables += [one for make in asked.more if (one := make(turns)).rows]
+    drawn = ends_picture(counted, asked.by, asked.split) if asked.picture is None else asked.picture(counted)
+    caption = f"{asked.title}: each group of turns."
+    made = Report(asked.title, f"{told}.", tables, [save_figure(drawn, folder, name, caption)])
+    made.write(folder)
+    print(made.markdown(), told, sep="\n")
+    return made
+
+
+def _split(names: str, known: Mapping[str, Any]) -> list[str]:
+    """Names separated by semicolons, or by commas where none of them has any."""
+    return [names] if names in known else names.split(";" if ";" in names else ",")
+
+
+def ask(
+    name: str, asked: Question, arguments: Sequence[str] | None = None, about: str | None = __doc__
+) -> Report:
+    """Run a question as the command line says, and print its report; the last line is the verdict."""
+    raw = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=about, formatter_class=raw)
+    parser.add_argument("--objects", default=asked.objects, help="names or paths")
+    parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1010"), help="FIRST:END")
+    parser.add_argument(
+        "--hands", default=asked.hands, help="see hands.py; also all, strong, losing, conditions"
+    )
+    parser.add_argument("--contenders", help=f"some of {'; '.join(asked.contenders)}")
+    parser.add_argument("--engine", default=asked.engine, choices=ENGINES)
+    parser.add_argument("--jobs", type=int, default=2, help="processes at once")
+    parser.add_argument("--out", type=Path, default=Path(f"{name}_output"), help="keeps what is finished")
+    parser.add_argument("--quick", action="store_true", help="one hand, object and seed, two contenders")
+    given = parser.parse_args(arguments)
+    names = _split(given.contenders, asked.contenders) if given.contenders else list(asked.contenders)
+    if unknown := set(names) - set(asked.contenders):
+        parser.error(f"no contender {', '.join(sorted(unknown))}; there are {'; '.join(asked.contenders)}")
+    found, items, seeds = hands(_split(given.hands, CONDITIONS)), given.objects.split(","), given.seeds
+    if given.quick:
+        found = dict(itertools.islice(found.items(), 1))
+        names, items, seeds = names[:2], items[: 2 if asked.together else 1], seeds[:1]
+    todo, keys = jobs(asked, found, names, items, seeds, given.engine, given.quick)
+    with progress("running", len(todo)) as advance:
+        results = run_jobs(session, todo, given.out, given.jobs, advance)
+    return report(asked, frame_of(results, keys), given.out, name)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    from questions import QUESTIONS
+
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, add_help=False
+    )
+    parser.add_argument("question", nargs="?", choices=QUESTIONS)
+    parser.add_argument("--list", action="store_true", help="the questions")
+    given, rest = parser.parse_known_args(arguments)
+    if given.list or given.question is None:
+        print(*(f"{name:16} {asked.title}" for name, asked in QUESTIONS.items()), sep="\n")
+        return
+    ask(given.question, QUESTIONS[given.question], rest)
+
+
+if __name__ == "__main__":
+    main()
