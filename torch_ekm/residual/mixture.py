@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import torch
 from torch import nn
-from torch.distributions import Distribution, Normal
+from torch.distributions import Normal
 
 from ..exceptions import ParameterError
 from ..typing import Float, Tensor
@@ -26,10 +26,11 @@ from .experts import (
     TREND_DECAY,
     YOUNG,
 )
+from .local_noise import LocalNoise
 from .mixture_engine import CompiledMixture
 from .printed import mixture
 from .report import MomentsWithJacobians, UpdateReport
-from .tails import MEMORY, ScaleMixture
+from .tails import MEMORY, ScaleMixture, ScaleMixtureLaw
 
 _SHARES = (0.0, 0.5, 1.0)  # values of h to choose from
 _CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # of kappa
@@ -46,8 +47,8 @@ class MixtureResidual(ResidualLearner):
         d_e <- .98 d_e + beta w_e,   l_e <- .995 l_e + rho w_e + d_e
         p_e ~ prior_e exp(sum_j memory^j log t_10(i_e(t-j) / s') - memory^t doubt_b)
 
-    s is the learners' deviation times the typical scale of ScaleMixture; s' is the larger of s and half the
-    running rms, at most 6 s; memory = 0.99.
+    s is the learners' deviation times ``r(x)`` of LocalNoise and the typical scale of ScaleMixture; s' is the
+    larger of s and half the running rms, at most 6 s; memory = 0.99.
 
     Differences of a noisy pose carry noise over: what one sample has too much, the next one lacks, so
     innovations correlate by up to -1/2 and ``kappa`` (the pose's share of the noise: the moving average
@@ -130,6 +131,7 @@ class MixtureResidual(ResidualLearner):
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.tails = ScaleMixture(self.out_features, **fleet)
+        self.noise = LocalNoise(self.in_features, self.out_features, **fleet)
         self._engine = CompiledMixture()
         self._settle()
 
@@ -154,15 +156,26 @@ class MixtureResidual(ResidualLearner):
         x = self.check_query(x)
         each = [learner.both_moments(x) for learner in self.members]
         mean, deviation, means = self._together([(m, v) for m, _, v in each])
-        deviation = deviation * self.inflation.sqrt()
+        deviation = deviation * self.inflation.sqrt() * self.noise.log_factor(x).exp().to(x.dtype)
         variances = self._wide(torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype))
         variance = self._spread(variances, self._apart(means, mean))
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
         return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
 
-    def predictive(self, x: Tensor) -> Distribution:
+    def predictive(self, x: Tensor) -> ScaleMixtureLaw:
         """Mixture of Student t laws about the mean: what log densities should be taken of."""
         return self.tails.law(*self._standard(x))
+
+    def unit_draws(self, x: Tensor, n: int, generator: torch.Generator | None) -> Tensor:
+        """Each draw of an output is one of a learner, by the learners' weights."""
+        each = torch.stack([one.unit_draws(x, n, generator).to(x.dtype) for one in self.members], dim=-1)
+        weights = self.weights.reshape(-1, each.shape[-1])
+        b = torch.multinomial(weights, n, replacement=True, generator=generator)
+        b = b.mT.reshape(n, *(1,) * (each.dim() - self.gain.dim() - 1), *self.gain.shape[:-1], 1)
+        return each.gather(-1, b.expand(*each.shape[:-1], 1)).squeeze(-1)
+
+    def _placed(self, x: Tensor, z: Tensor, generator: torch.Generator | None) -> Tensor:
+        return self.predictive(x).placed(z, generator)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """The learners' slopes, weighted; what is carried over does not depend on x."""
@@ -209,9 +222,10 @@ class MixtureResidual(ResidualLearner):
         variance = self._spread(v, apart)
         of_v, of_m = p @ h.square(), 2.0 * (p * apart) @ h
         slope = (of_v.unsqueeze(-2) * dv).sum(-1) + (of_m.unsqueeze(-2) * dm).sum(-1)
-        share, inflation = self.weights, self.inflation
-        most = inflation * (share * self._wide(noisy.to(x.dtype))).sum(-1)
-        steepest = inflation.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1)
+        log_factor, by_x = (value.to(x.dtype) for value in self.noise.with_slope(x))
+        share, local = self.weights, self.inflation * (2.0 * log_factor).exp()
+        most = local * (share * self._wide(noisy.to(x.dtype))).sum(-1)
+        steepest = local.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1) + 2.0 * most.unsqueeze(-1) * by_x
         return MomentsWithJacobians(
             mean,
             torch.minimum(variance, most),
@@ -259,6 +273,7 @@ class MixtureResidual(ResidualLearner):
         self.evidence.copy_(self.first_evidence)
         self.inflation.fill_(1.0)
         self.tails.reset()
+        self.noise.reset()
         self._settle()
 
     @torch.no_grad()
@@ -288,7 +303,7 @@ class MixtureResidual(ResidualLearner):
         report = self._engine.learn(self, x, y, mask)
         if report is not None:
             return report
-        nis = self._judged(y, mask, [learner.moments(x, observation=True) for learner in self.members])
+        nis = self._judged(x, y, mask, [learner.moments(x, observation=True) for learner in self.members])
         reports = [learner.step(x, y, mask) for learner in self.members]
         part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
@@ -300,9 +315,12 @@ class MixtureResidual(ResidualLearner):
 
     # -- pieces ---------------------------------------------------------------------------------
 
-    def _judged(self, y: Tensor, mask: Tensor | None, moments: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    def _judged(
+        self, x: Tensor, y: Tensor, mask: Tensor | None, moments: Sequence[tuple[Tensor, Tensor]]
+    ) -> Tensor:
         """Evidence, what is carried over, variance and tails after one sample per model; returns the nis."""
         mean, deviation, means = self._together(moments)
+        deviation = deviation * self.noise.log_factor(x).exp().to(deviation)
         # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
         # heeds the few large samples of a stream that mostly rests, too
         typical = self.tails.typical()
@@ -334,6 +352,7 @@ class MixtureResidual(ResidualLearner):
             on = judged[(..., *(None,) * (value.dim() - judged.dim()))]
             buffer.copy_(torch.where(on, value, buffer))
         nis = (z.square() / self.inflation).mean(-1)
+        self.noise.observe(x, z / typical, judged)
         self.tails.observe(z, (self.count - YOUNG).clamp_min(0.0), judged)
         self.count += 1.0 if mask is None else mask.to(self.count.dtype)
         self._settle()
@@ -376,7 +395,8 @@ class MixtureResidual(ResidualLearner):
         if found is not None:
             return found.mean, found.standard
         x = self.check_query(x)
-        return self._together([learner.moments(x, observation=True) for learner in self.members])[:2]
+        mean, deviation, _ = self._together([one.moments(x, observation=True) for one in self.members])
+        return mean, deviation * self.noise.log_factor(x).exp().to(deviation)
 
     def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
         means, variances = (torch.stack(part, dim=-1).to(self.dtype) for part in zip(*moments, strict=True))
