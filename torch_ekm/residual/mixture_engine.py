@@ -87,7 +87,7 @@ class CompiledMixture:
         figures, events, errors = (
             np.zeros((k + 1, 4, n)), np.zeros((k + 1, n), np.int64), np.zeros((k + 1, n, m))
         )  # fmt: skip
-        of_all, judged = np.empty((3, n)), np.empty(n, np.bool_)
+        of_all, said, judged = np.empty((3, n)), np.empty((2, n * m)), np.empty(n, np.bool_)
         if mask is not None:
             figures[:, 2] = 1.0
         turns = []
@@ -102,23 +102,23 @@ class CompiledMixture:
             turns.append(_SKIP if apart else learner.engine.begin(learner, x, y, mask))
         alarm = loops.update_mixture(
             bound.row, self._members, np.array(turns), on_array(bound, mask), judged, x.data_ptr(),
-            y.data_ptr(), means, noisy, local, local.ctypes.data, figures, events, errors, of_all,
+            y.data_ptr(), means, noisy, local, local.ctypes.data, said, figures, events, errors, of_all,
         )  # fmt: skip
         done_apart = False
         for i, (plan, learner) in enumerate(zip(plans, learners, strict=True)):
+            t, on = y, mask
             if i == k:
                 if not alarm >> k:
                     break
-                y, mask = (
-                    torch.from_numpy(local.reshape(y.shape)),
-                    torch.from_numpy(judged.reshape(g.batch_shape)),
+                t, on = (
+                    torch.from_numpy(a.reshape(s)) for a, s in ((local, y.shape), (judged, g.batch_shape))
                 )
             if turns[i] is not _SKIP:
                 assert plan is not None
                 facing = i < k and bool(alarm >> i & 1)
-                learner.engine.finish(learner, x, y, mask, facing, figures[i], events[i], errors[i])
+                learner.engine.finish(learner, x, t, on, facing, figures[i], events[i], errors[i])
                 continue
-            report = learner.step(x, y, mask)
+            report = learner.step(x, t, on)
             if i < k:
                 done_apart = True
                 events[i], figures[i, 0] = report.event.reshape(-1), report.novelty.reshape(-1)
@@ -126,6 +126,8 @@ class CompiledMixture:
         if done_apart:
             part = g.weights.mean(-2).reshape(n, k).T.numpy()
             of_all[1], of_all[2] = (part * figures[:k, 0]).sum(0), (part * figures[:k, 2]).sum(0)
+        if g.returns is not None and (mask is None or bool(mask)):
+            g.note_return(x, y.numpy(), said, float(of_all[0, 0]))
         nis, novelty, weight = torch.from_numpy(of_all.reshape(3, *g.batch_shape)).unbind()
         event = torch.from_numpy(events[:k].max(0).reshape(tuple(g.batch_shape)))
         return UpdateReport(event, novelty, nis, weight)

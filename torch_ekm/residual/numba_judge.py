@@ -17,7 +17,7 @@ from . import local_noise as L
 from . import mixture_plan as G
 from .base import FARTHEST as FARTHEST_MEAN
 from .sparse_gp import plan as P
-from .sparse_gp.engine.numba_math import A1, I1, INNER, INT, TINY, F, exp, log, matrix_at, vector_at
+from .sparse_gp.engine.numba_math import A1, A2, I1, INNER, INT, TINY, F, exp, log, matrix_at, vector_at
 from .tails import LARGEST, MEMORY
 
 
@@ -185,11 +185,12 @@ def make_finite(g, o, means, variances):
         variances[i] = variances[i] if math.isfinite(variances[i]) else most * most
 
 
-@njit(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1, A1), **INNER)
-def judge(g, o, y, judged, since, means, noisy, far, p, local):
+@njit(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1, A1, A2), **INNER)
+def judge(g, o, y, judged, since, means, noisy, far, p, local, said):
     """One output of one model: how far y lies from each expert's mean, and what follows; returns the nis.
 
-    ``local``: f of LocalNoise for each output, which becomes what it is to learn.
+    ``local``: f of LocalNoise for each output, which becomes what it is to learn; ``said``: room for the
+    mean and typical deviation.
     """
     n, n_learners = g[G.N_EXPERTS], means.shape[0]
     each, inflation = n // n_learners, vector_at(g[G.INFLATION], o, 1)
@@ -199,11 +200,11 @@ def judge(g, o, y, judged, since, means, noisy, far, p, local):
     log_factor = share_of_noise(g, o) * f
     mean = min(max(mean_of(g, o, means), -most), most)
     deviation = math.sqrt(scatter_of(g, o, noisy)) * math.exp(log_factor)
-    z = _bounded((y - mean) / deviation)
+    z, tails = _bounded((y - mean) / deviation), g[G.N_TAILS]
+    typical = _typical(vector_at(g[G.TAIL_SCALE], o, tails), vector_at(g[G.TAIL_EVIDENCE], o, tails))
+    scale = deviation * typical
+    said[0, o], said[1, o] = mean, scale
     if judged:
-        tails = g[G.N_TAILS]
-        typical = _typical(vector_at(g[G.TAIL_SCALE], o, tails), vector_at(g[G.TAIL_EVIDENCE], o, tails))
-        scale = deviation * typical
         width = min(max(E.RMS_LEAST * math.sqrt(inflation[0]) / typical, 1.0), E.RMS_MOST)
         w, level = vector_at(g[G.INNOVATION], o, n), vector_at(g[G.LEVEL], o, n)
         for i in range(n_learners):

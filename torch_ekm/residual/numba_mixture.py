@@ -41,24 +41,11 @@ def _of_all(g, figures, of_all):
                 of_all[2, b] += mass[k] * figures[i, 2, b] / m
 
 
-@njit(INT(I1, I2, I2, ON, ON, INT, INT, A2, A2, A1, INT, A3, I2, A3, A2), **COMMON)
+@njit(INT(I1, I2, I2, ON, ON, INT, INT, A2, A2, A1, INT, A2, A3, I2, A3, A2), **COMMON)
 def update_mixture(
-    g,
-    members,
-    turns,
-    on,
-    judged_on,
-    x,
-    y,
-    means,
-    noisy,
-    local,
-    local_address,
-    figures,
-    events,
-    errors,
-    of_all,
-):
+    g, members, turns, on, judged_on, x, y, means, noisy, local, local_address, said, figures, events,
+    errors, of_all,
+):  # fmt: skip
     """One sample per model where ``on``: all learners predict, the mixture judges them, they learn.
 
     Args:
@@ -66,6 +53,7 @@ def update_mixture(
         x, y: addresses.
         judged_on: where the mixture judged, and so the noise learned.
         local: room for what the noise learns, at that address.
+        said: room for mean and typical deviation of y, ``(2, models out)``.
         means, noisy: of y, from learners of other kinds, ``(models out, learners)``.
         figures, events, errors: see ``update_fleet``, one for each learner.
         of_all: nis, novelty and weight of the mixture, ``(3, models)``; the last two where all learned here.
@@ -111,7 +99,9 @@ def update_mixture(
             make_finite(g, r, means[r], noisy[r])
             judged = on[b] and count[0] >= E.YOUNG
             since = max(count[0] - E.YOUNG, 0.0)
-            nis += judge(g, r, vector_at(y, r, 1)[0], judged, since, means[r], noisy[r], far, p, local) / m
+            nis += (
+                judge(g, r, vector_at(y, r, 1)[0], judged, since, means[r], noisy[r], far, p, local, said) / m
+            )
         judged_on[b] = judged
         alarm |= int(judged) << n_learners
         if on[b]:
@@ -119,9 +109,9 @@ def update_mixture(
         of_all[0, b] = nis
     at = 0
     for i in range(n_learners + 1):
-        a, y_, on_ = members[i], y, on
+        a, learned, on_ = members[i], y, on
         if i == n_learners:
-            y_, on_ = local_address, judged_on
+            learned, on_ = local_address, judged_on
             if not alarm >> n_learners & 1:
                 break
         if not a[P.MODELS]:
@@ -133,12 +123,12 @@ def update_mixture(
             if on_[b] and turns[i, P.MODE] != P.SKIP:
                 prior = room[at + n + W + 2 * M]
                 events[i, b] = gp.learn(
-                    a, b, values, q, k, Ck, prior, vector_at(y_, b, m), t, found, errors[i, b]
+                    a, b, values, q, k, Ck, prior, vector_at(learned, b, m), t, found, errors[i, b]
                 )
                 for r in range(4):
                     figures[i, r, b] = found[r]
             at += n + W + 2 * M + 1
-        if gp.note(a, turns[i], on_, x, y_, figures[i], errors[i]):
+        if gp.note(a, turns[i], on_, x, learned, figures[i], errors[i]):
             alarm |= 1 << i
     _of_all(g, figures, of_all)
     return alarm
