@@ -14,6 +14,7 @@ from ..typing import Float, Tensor
 from .base import ResidualLearner
 from .local_noise import LocalNoise
 from .mixture_engine import CompiledMixture
+from .printed import mixture
 from .report import MomentsWithJacobians
 from .tails import ScaleMixture, ScaleMixtureLaw
 
