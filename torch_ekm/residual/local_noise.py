@@ -44,26 +44,26 @@ class LocalNoise(nn.Module):
             **options,
         )  # fmt: skip
         like = self.gp.posterior.basis
-        self._shares = nn.Buffer(like.new_tensor(SHARES), persistent=False)
+        self.shares = nn.Buffer(like.new_tensor(SHARES), persistent=False)
         self.evidence = nn.Buffer(like.new_zeros(*self.gp.batch_shape, out_features, len(SHARES)))
 
     def log_factor(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*all out"]:
         """log r(x)."""
-        return self._share() * self._f(x)
+        return self.share() * self._f(x)
 
     def with_slope(self, x: Float[Tensor, "*any in"]) -> tuple[Tensor, Float[Tensor, "*all out in"]]:
         """log r(x) and its derivative."""
         f, slope = self.gp.linearize(x)
-        slope = slope * (self._share() * (f.abs() < REACH)).unsqueeze(-1)
-        return self._share() * f.clamp(-REACH, REACH), slope
+        slope = slope * (self.share() * (f.abs() < REACH)).unsqueeze(-1)
+        return self.share() * f.clamp(-REACH, REACH), slope
 
     def observe(
         self, x: Float[Tensor, "*batch in"], i: Float[Tensor, "*batch out"], mask: Bool[Tensor, "*batch"]
     ) -> None:
         """Learn from an innovation per model where ``mask``, in typical ones of that place."""
         f = self._f(x)
-        size = i.abs().clamp_min(torch.finfo(i.dtype).tiny).log() + self._share() * f
-        log_scale = self._shares * f.unsqueeze(-1)
+        size = i.abs().clamp_min(torch.finfo(i.dtype).tiny).log() + self.share() * f
+        log_scale = self.shares * f.unsqueeze(-1)
         z2 = (2.0 * (size.unsqueeze(-1) - log_scale)).exp()
         evidence = MEMORY * self.evidence - log_scale - 0.5 * (FREEDOM + 1.0) * torch.log1p(z2 / FREEDOM)
         evidence = evidence - evidence.amax(-1, keepdim=True)
@@ -71,8 +71,9 @@ class LocalNoise(nn.Module):
         target = ((size - f).exp().clamp_max(MOST) + FLOOR).log() + CENTRE + f
         self.gp.step(x, target, mask)
 
-    def _share(self) -> Float[Tensor, "*batch out"]:
-        return self.evidence.softmax(-1) @ self._shares
+    def share(self) -> Float[Tensor, "*batch out"]:
+        """s."""
+        return self.evidence.softmax(-1) @ self.shares
 
     def _f(self, x: Tensor) -> Float[Tensor, "*all out"]:
         return self.gp(x).clamp(-REACH, REACH)

@@ -205,10 +205,8 @@ class MixtureResidual(MixtureQueries):
         if self.returns is None:
             return
         i = self._watched
-        state = self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis)
-        if state is None:
+        if not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis):
             return
-        self.learners[i] = state
         best = self.owner[:, i] > 0
         for experts, most in ((best, 0.0), (~best, -_BEHIND)):
             if bool(experts.any()):

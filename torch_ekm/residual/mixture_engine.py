@@ -163,6 +163,7 @@ class CompiledMixture:
             G.INFLATION: g.inflation, G.COUNT: g.count, G.RATES: tails.rates,
             G.FREEDOMS: tails.freedoms, G.TAIL_SCALE: tails.log_scale,
             G.TAIL_EVIDENCE: tails.evidence, G.NOISE_EVIDENCE: g.noise.evidence,
+            G.NOISE_SHARES: g.noise.shares,
         }  # fmt: skip
         bound.watch((g, tails, g.noise), g._modules, g.learners._modules, g.noise._modules)
         bound.usable = all(

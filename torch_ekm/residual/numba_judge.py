@@ -20,6 +20,8 @@ from .sparse_gp import plan as P
 from .sparse_gp.engine.numba_math import A1, A2, I1, INNER, INT, TINY, F, exp, log, matrix_at, vector_at
 from .tails import LARGEST, MEMORY
 
+_N = len(L.SHARES)
+
 
 @njit(F(F), **INNER)
 def _bounded(z):
@@ -27,16 +29,16 @@ def _bounded(z):
 
 
 @njit(F(A1, A1), **INNER)
-def _typical(log_scale, evidence):
-    """See ``ScaleMixture.typical``."""
+def _believed(values, evidence):
+    """Their mean, weighted by evidence."""
     most, total, mean = -np.inf, 0.0, 0.0
     for t in range(evidence.shape[0]):
         most = max(most, evidence[t])
     for t in range(evidence.shape[0]):
         p = math.exp(evidence[t] - most)
         total += p
-        mean += p * log_scale[t]
-    return math.exp(mean / total)
+        mean += p * values[t]
+    return mean / total
 
 
 @njit(types.void(I1, INT, F, F), **INNER)
@@ -63,23 +65,16 @@ def _follow_tails(g, o, z, since):
 @njit(F(I1, INT), **INNER)
 def share_of_noise(g, o):
     """s of LocalNoise."""
-    n, most, total, mean = len(L.SHARES), -np.inf, 0.0, 0.0
-    evidence = vector_at(g[G.NOISE_EVIDENCE], o, n)
-    for s in range(n):
-        most = max(most, evidence[s])
-    for s in range(n):
-        p = math.exp(evidence[s] - most)
-        total, mean = total + p, mean + p * L.SHARES[s]
-    return mean / total
+    return _believed(vector_at(g[G.NOISE_SHARES], 0, _N), vector_at(g[G.NOISE_EVIDENCE], o, _N))
 
 
 @njit(F(I1, INT, F, F), **INNER)
 def _target_of_noise(g, o, size, f):
     """What f learns of a log innovation, after its evidence, see ``LocalNoise.observe``."""
-    n, most = len(L.SHARES), -np.inf
-    evidence = vector_at(g[G.NOISE_EVIDENCE], o, n)
+    n, most = _N, -np.inf
+    shares, evidence = vector_at(g[G.NOISE_SHARES], 0, n), vector_at(g[G.NOISE_EVIDENCE], o, n)
     for s in range(n):
-        log_scale = L.SHARES[s] * f
+        log_scale = shares[s] * f
         z2 = math.exp(2.0 * (size - log_scale))
         evidence[s] = L.MEMORY * evidence[s] - log_scale
         evidence[s] -= 0.5 * (L.FREEDOM + 1.0) * math.log1p(z2 / L.FREEDOM)
@@ -201,7 +196,8 @@ def judge(g, o, y, judged, since, means, noisy, far, p, local, said):
     mean = min(max(mean_of(g, o, means), -most), most)
     deviation = math.sqrt(scatter_of(g, o, noisy)) * math.exp(log_factor)
     z, tails = _bounded((y - mean) / deviation), g[G.N_TAILS]
-    typical = _typical(vector_at(g[G.TAIL_SCALE], o, tails), vector_at(g[G.TAIL_EVIDENCE], o, tails))
+    log_scale = vector_at(g[G.TAIL_SCALE], o, tails)
+    typical = math.exp(_believed(log_scale, vector_at(g[G.TAIL_EVIDENCE], o, tails)))
     scale = deviation * typical
     said[0, o], said[1, o] = mean, scale
     if judged:

@@ -29,9 +29,9 @@ class Returns(nn.Module):
         a_j <- max(0, .9 a_j + min(10, c(mean)) - c(mean_j)),   c(mean) = sum 11/2 log(1 + z^2/10)
 
     c sums over the outputs, z is the error of the mixture's mean, or of the j-th state's, in the mixture's
-    typical deviations. Where a_j exceeds 8 the j-th state takes the learner's place and the learner's its, so
-    one or two samples suffice. A copy of the state is made every 64 samples while all goes well, so that a
-    change, which is noticed samples later, does not spoil what is kept. Two regimes are kept; the older goes.
+    typical deviations. Where a_j exceeds 8 the learner and the j-th state change places: one or two samples
+    suffice. A copy of the state is made every 64 samples while all goes well, so that a change, which is
+    noticed samples later, does not spoil what is kept. Two regimes are kept; the older one goes.
 
     Args:
         learner: whose states are kept.
@@ -62,8 +62,8 @@ class Returns(nn.Module):
         for name, value in state.items():
             setattr(self, name, value)
 
-    def observe(self, learner: Host, x: Tensor, y: AnyArray, said: AnyArray, nis: float) -> Host | None:
-        """Take note of a sample that was learned; the state that is to take the learner's place, if one is.
+    def observe(self, learner: Host, x: Tensor, y: AnyArray, said: AnyArray, nis: float) -> bool:
+        """Take note of a sample that was learned; whether the learner is in an old state from now on.
 
         Args:
             said: mean of the mixture before, and its typical deviation, ``(2, out)``.
@@ -75,9 +75,11 @@ class Returns(nn.Module):
         if self.evidence and (nis > _SURPRISE or any(self.evidence)):
             j = self._judge(x, y, said)
             if self.evidence[j] > _ENOUGH and not self.rest:
-                back, states[j] = states[j], learner
+                copy_state(states[_KEPT], learner)
+                copy_state(learner, states[j])
+                states[j], states[_KEPT] = states[_KEPT], states[j]
                 known |= {"evidence": [0.0] * len(self.evidence), "is_copied": False, "rest": _REST}
-                return back  # type: ignore[return-value]
+                return True
         level = float(changes.level)
         if level == COOL and self.is_copied:
             kept, new = list(states[:_KEPT]), states[_KEPT]
@@ -89,7 +91,7 @@ class Returns(nn.Module):
         elif self.n % _EVERY == 0 and not self.rest and _CALM[0] < level < _CALM[1]:
             known["is_copied"] = True
             copy_state(states[_KEPT], learner)
-        return None
+        return False
 
     def _judge(self, x: Tensor, y: AnyArray, said: AnyArray) -> int:
         """The state that fits best, after this sample."""

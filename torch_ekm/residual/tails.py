@@ -52,7 +52,9 @@ class ScaleMixtureLaw(MixtureSameFamily):
             low, high = torch.where(below, half, low), torch.where(below, high, half)
         return 0.5 * (low + high)
 
-    def placed(self, z: Float[Tensor, n * any], generator: torch.Generator | None) -> Float[Tensor, n * any]:
+    def placed(
+        self, z: Float[Tensor, "*n_and_any"], generator: torch.Generator | None
+    ) -> Float[Tensor, "*n_and_any"]:
         """Draws ``mean + s z / sqrt(chi2 / nu)`` of this law, whose normal parts z are given."""
         t: Any = self.component_distribution
         shares = self.mixture_distribution.probs.expand(t.batch_shape).flatten(0, -2)
