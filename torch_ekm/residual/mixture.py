@@ -30,6 +30,7 @@ from .mixture_engine import CompiledMixture
 from .mixture_queries import MixtureQueries
 from .report import UpdateReport
 from .returns import Returns
+from .sparse_gp.monitor import COOL, DetectChanges
 from .sparse_gp.part import Host
 from .tails import MEMORY, ScaleMixture
 
@@ -138,7 +139,7 @@ class MixtureResidual(MixtureQueries):
         self.tails = ScaleMixture(self.out_features, **fleet)
         self.noise = LocalNoise(self.in_features, self.out_features, **fleet)
         watched = Returns.watched(members)
-        self._watched = -1 if watched is None else watched
+        self.watched = -1 if watched is None else watched
         self.returns = None if watched is None else Returns(cast("Host", members[watched]))
         self._engine = CompiledMixture()
         self._settle()
@@ -191,7 +192,8 @@ class MixtureResidual(MixtureQueries):
         nis, *said = self._judged(x, y, mask, moments)
         reports = [learner.step(x, y, mask) for learner in self.members]
         if self.returns is not None and (mask is None or bool(mask)):
-            self.note_return(x, y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis))
+            figures = y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis), self.has_changed()
+            self.note_return(x, *figures)
         part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
             (part * torch.stack(each, dim=-1).to(part)).sum(-1)
@@ -200,12 +202,17 @@ class MixtureResidual(MixtureQueries):
         event = torch.stack([one.event for one in reports]).amax(0)
         return UpdateReport(event, novelty, nis, weight)
 
-    def note_return(self, x: Tensor, y: AnyArray, said: AnyArray, nis: float) -> None:
+    def has_changed(self) -> bool:
+        """Whether the learner that notes changes started again at the last sample."""
+        changes = cast("Host", self.learners[self.watched]).part(DetectChanges)
+        return changes is not None and float(changes.level) == COOL
+
+    def note_return(self, x: Tensor, y: AnyArray, said: AnyArray, nis: float, changed: bool) -> None:
         """After a sample of one model: a regime that is back takes its learner's place, see Returns."""
         if self.returns is None:
             return
-        i = self._watched
-        if not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis):
+        i = self.watched
+        if not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis, changed):
             return
         best = self.owner[:, i] > 0
         for experts, most in ((best, 0.0), (~best, -_BEHIND)):

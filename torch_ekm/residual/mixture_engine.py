@@ -127,7 +127,8 @@ class CompiledMixture:
             part = g.weights.mean(-2).reshape(n, k).T.numpy()
             of_all[1], of_all[2] = (part * figures[:k, 0]).sum(0), (part * figures[:k, 2]).sum(0)
         if g.returns is not None and (mask is None or bool(mask)):
-            g.note_return(x, y.numpy(), said, float(of_all[0, 0]))
+            changed = alarm >> g.watched & 1 or (turns[g.watched] is _SKIP and g.has_changed())
+            g.note_return(x, y.numpy(), said, float(of_all[0, 0]), bool(changed))
         nis, novelty, weight = torch.from_numpy(of_all.reshape(3, *g.batch_shape)).unbind()
         event = torch.from_numpy(events[:k].max(0).reshape(tuple(g.batch_shape)))
         return UpdateReport(event, novelty, nis, weight)
@@ -142,11 +143,8 @@ class CompiledMixture:
             return None
         if self._bound is None or not self._bound.is_current():
             self._bound = self._bind(g)
-            self._learners = [*g.members, g.noise.gp]
-        plans = [
-            one.engine.of(one) if isinstance(getattr(one, "engine", None), CompiledEngine) else None
-            for one in self._learners
-        ]
+            self._learners, self._noise = [*g.members, g.noise.gp], _plan(g.noise.gp)
+        plans = [*map(_plan, self._learners[:-1]), self._noise]  # nobody else changes the GP of the noise
         if plans != self._plans:
             self._plans = plans
             none = np.zeros(P.FIELDS, np.int64)
@@ -177,6 +175,12 @@ class CompiledMixture:
         row[G.N_TAILS], row[G.AT_ZERO] = len(tails.rates), bound.own(at_zero.numpy().copy())
         bound.all = np.ones(row[P.MODELS], np.bool_)
         return bound
+
+
+def _plan(learner: Any) -> Plan | None:
+    """What compiled loops know of a learner; None: nothing."""
+    engine = getattr(learner, "engine", None)
+    return engine.of(learner) if isinstance(engine, CompiledEngine) else None
 
 
 _SKIP = P.SKIP, -1, -1, -1, -1, 0

@@ -12,7 +12,7 @@ from torch import nn
 from ..typing import AnyArray, Tensor
 from .base import ResidualLearner
 from .experts import FREEDOM
-from .sparse_gp.monitor import COOL, DetectChanges
+from .sparse_gp.monitor import DetectChanges
 from .sparse_gp.part import Host
 
 _KEPT = 2  # regimes
@@ -55,23 +55,28 @@ class Returns(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         """What is known of the states."""
-        return {name: getattr(self, name) for name in ("evidence", "is_copied", "n", "rest")}
+        known = {name: getattr(self, name) for name in ("is_copied", "n", "rest")}
+        return {**known, "evidence": list(self.evidence)}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """See :meth:`get_extra_state`."""
         for name, value in state.items():
-            setattr(self, name, value)
+            setattr(self, name, list(value) if name == "evidence" else value)
 
-    def observe(self, learner: Host, x: Tensor, y: AnyArray, said: AnyArray, nis: float) -> bool:
+    def observe(
+        self, learner: Host, x: Tensor, y: AnyArray, said: AnyArray, nis: float, changed: bool
+    ) -> bool:
         """Take note of a sample that was learned; whether the learner is in an old state from now on.
 
         Args:
+            changed: whether the learner has started again.
             said: mean of the mixture before, and its typical deviation, ``(2, out)``.
         """
         known = vars(self)  # an assignment to a Module takes ten times as long
         known["n"], known["rest"] = self.n + 1, max(self.rest - 1, 0)
-        changes, states = learner.part(DetectChanges), self.states
-        assert changes is not None
+        if not (changed or self.evidence or self.n % _EVERY == 0):
+            return False
+        states = self.states
         if self.evidence and (nis > _SURPRISE or any(self.evidence)):
             j = self._judge(x, y, said)
             if self.evidence[j] > _ENOUGH and not self.rest:
@@ -80,15 +85,14 @@ class Returns(nn.Module):
                 states[j], states[_KEPT] = states[_KEPT], states[j]
                 known |= {"evidence": [0.0] * len(self.evidence), "is_copied": False, "rest": _REST}
                 return True
-        level = float(changes.level)
-        if level == COOL and self.is_copied:
+        if changed and self.is_copied:
             kept, new = list(states[:_KEPT]), states[_KEPT]
             at = len(self.evidence)
             order = [*kept[:at], new, *kept[at:]] if at < _KEPT else [*kept[1:], new, kept[0]]
             for place, state in enumerate(order):
                 states[place] = state
             known |= {"evidence": [0.0] * min(at + 1, _KEPT), "is_copied": False, "rest": _REST}
-        elif self.n % _EVERY == 0 and not self.rest and _CALM[0] < level < _CALM[1]:
+        elif self.n % _EVERY == 0 and not self.rest and _is_calm(learner):
             known["is_copied"] = True
             copy_state(states[_KEPT], learner)
         return False
@@ -97,9 +101,14 @@ class Returns(nn.Module):
         """The state that fits best, after this sample."""
         most = min(_cost(y, said[0], said[1]), _MOST)
         for j, before in enumerate(self.evidence):
-            mean = self.states[j](x).numpy()
+            mean = self.states[j](x).cpu().numpy()
             self.evidence[j] = max(0.0, _MEMORY * before + most - _cost(y, mean, said[1]))
         return int(np.argmax(self.evidence))
+
+
+def _is_calm(learner: Host) -> bool:
+    changes = learner.part(DetectChanges)
+    return changes is not None and _CALM[0] < float(changes.level) < _CALM[1]
 
 
 def _cost(y: AnyArray, mean: AnyArray, deviation: AnyArray) -> float:
