@@ -128,7 +128,7 @@ def back(n: int, seed: int) -> float:
 
 
 def thirds(n: int, seed: int) -> float:
-    """Largest distance from 0.9 of the share that 90 % intervals hold, in thirds by the predicted deviation."""
+    """Largest distance from 0.9 of what 90 % intervals hold, in thirds by the predicted deviation."""
     samples, learner, held = noisy_side(min(n, 1000), seed), default_learner(1, 1), []
     for x, y in zip(samples.x, samples.y, strict=True):
         inside = abs(float(learner.predictive(x).cdf(y)) - 0.5) <= 0.45
