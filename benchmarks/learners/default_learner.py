@@ -18,9 +18,11 @@ from default_streams import (
     arm,
     from_rest,
     jumping,
+    noisy_side,
     product_of_two,
     pure_noise,
     streams,
+    there_and_back,
     wide_and_noisy,
     with_outliers,
 )
@@ -117,6 +119,25 @@ def fast_arm(n: int, seed: int) -> float:
     return float(after / before)
 
 
+def back(n: int, seed: int) -> float:
+    """Error over the first 50 samples after a system that was known came back."""
+    n = min(n, 900)
+    samples, at = there_and_back(n, seed), 8 * n // 9
+    error = run(default_learner, samples).error[at : at + 50]
+    return float(error.square().mean().sqrt() / samples.y[at : at + 50].square().mean().sqrt())
+
+
+def thirds(n: int, seed: int) -> float:
+    """Largest distance from 0.9 of what 90 % intervals hold, in thirds by the predicted deviation."""
+    samples, learner, held = noisy_side(min(n, 1000), seed), default_learner(1, 1), []
+    for x, y in zip(samples.x, samples.y, strict=True):
+        inside = abs(float(learner.predictive(x).cdf(y)) - 0.5) <= 0.45
+        held.append([float(learner.predict(x, observation=True).stddev), float(inside)])
+        learner.update(x, y)
+    deviation, within = torch.tensor(held[len(held) // 10 :]).unbind(-1)
+    return max(abs(float(part.mean()) - 0.9) for part in within[deviation.argsort()].chunk(3))
+
+
 #: What the default must bear: ``measure(n, seed)``, at most allowed.
 BARS: dict[str, tuple[Callable[[int, int], float], float]] = {
     "pure noise, error / model alone": (
@@ -128,6 +149,8 @@ BARS: dict[str, tuple[Callable[[int, int], float], float]] = {
     "start at rest, error after it": (start_at_rest, 0.75),
     "32 inputs, three matter: error / best single one's": (wide, 1.05),
     "arm at 100 Hz, error / that of the residual before": (fast_arm, 0.95),
+    "a system that comes back, error of its first 50 samples": (back, 0.3),
+    "noise of x, thirds by what is predicted: coverage of 90 % off by": (thirds, 0.05),
 }
 
 

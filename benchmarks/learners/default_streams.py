@@ -79,6 +79,24 @@ def jumping(n: int, seed: int, at: int = 400) -> Samples:
     return Samples(x, y + shift, f + shift)
 
 
+def there_and_back(n: int, seed: int) -> Samples:
+    """Two systems of four inputs; from 4/9 to 8/9 of the samples it is the second one."""
+    g = torch.Generator().manual_seed(seed)
+    first, second = 0.7 * torch.randn(2, 4, 2, generator=g, dtype=torch.float64)
+    x = torch.randn(n, 4, generator=g, dtype=torch.float64)
+    t = torch.arange(n).unsqueeze(-1)
+    f = torch.where((t >= 4 * n // 9) & (t < 8 * n // 9), torch.sin(x @ second), torch.sin(x @ first))
+    return Samples(x, f + 0.05 * torch.randn(n, 2, generator=g, dtype=torch.float64), f)
+
+
+def noisy_side(n: int, seed: int) -> Samples:
+    """A sine whose noise grows from 0.08 to 0.71 along the input."""
+    g = torch.Generator().manual_seed(seed)
+    x = 2.0 * torch.rand(n, 1, generator=g, dtype=torch.float64) - 1.0
+    f, noise = torch.sin(3.0 * x), 0.08 + 0.63 * (x + 1.0) / 2.0
+    return Samples(x, f + noise * torch.randn(n, 1, generator=g, dtype=torch.float64), f)
+
+
 def with_outliers(n: int, seed: int) -> Samples:
     """A tenth of y lies 30 standard deviations off."""
     x, y, f = smooth(n, seed)

@@ -32,7 +32,6 @@ from torch_ekm.residual import (
     ForgettingFactor,
     LearnHyperparameters,
     Matern32,
-    Matern52,
     ProcessNoise,
     RobustWeight,
     SparseOnlineGP,
@@ -84,7 +83,6 @@ def options_of_all_kinds() -> dict[str, dict[str, Any]]:
     return {
         "bare": {"kernel": kernel},
         "Matern 3/2": {"kernel": Matern32(4, lengthscale=1.0)},
-        "Matern 5/2": {"kernel": Matern52(4, lengthscale=1.0)},
         "action-linear": {"kernel": ActionLinearKernel(4, 2)},
         "deep": {"kernel": DeepKernel(SquaredExponential(4))},
         "robust, forgets": {"kernel": kernel, "parts": [RobustWeight(3.0), ForgettingFactor(0.99)]},

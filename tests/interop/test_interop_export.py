@@ -27,7 +27,6 @@ from torch_ekm.residual import (
     DeepKernel,
     LinearKernel,
     Matern32,
-    Matern52,
     RecursiveLeastSquares,
     SquaredExponential,
 )
@@ -46,7 +45,6 @@ def wandering(d: int = 3, m: int = 2) -> SparseOnlineGP:
 LEARNERS = {
     "plain": lambda: SparseOnlineGP(3, 2, capacity=15),
     "matern32": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=Matern32(3), parts=[Standardize()]),
-    "matern52": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=Matern52(3)),
     "action-linear": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=ActionLinearKernel(3, 1)),
     "linear": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=LinearKernel(3, slope_variance=2.0)),
     "squared exponential": lambda: SparseOnlineGP(3, 2, capacity=12, kernel=SquaredExponential(3)),

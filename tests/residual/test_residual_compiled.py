@@ -19,7 +19,6 @@ from torch_ekm.residual import (
     LearnHyperparameters,
     LinearKernel,
     Matern32,
-    Matern52,
     ProcessNoise,
     RobustWeight,
     SparseOnlineGP,
@@ -56,7 +55,7 @@ def all_parts() -> list:
 OPTIONS = {
     "plain": lambda shape: {},
     "matern32": lambda shape: {"kernel": Matern32(D, lengthscale=[1.0, 2.0, 3.0, 4.0], batch_shape=shape)},
-    "matern52": lambda shape: {"kernel": Matern52(D, variance=2.0)},
+    "shared kernel": lambda shape: {"kernel": Matern32(D, variance=2.0)},
     "action": lambda shape: {
         "kernel": ActionLinearKernel(D, 2, state_kernel=Matern32(2, batch_shape=shape), batch_shape=shape),
         "parts": [Standardize(), RobustWeight(3.0)],

@@ -17,7 +17,6 @@ from torch_ekm.residual import (
     DeepKernel,
     LinearKernel,
     Matern32,
-    Matern52,
     MixtureResidual,
     RandomFeatureRLS,
     RecursiveLeastSquares,
@@ -131,7 +130,6 @@ def test_a_member_that_is_not_finite_has_no_say(reference, monkeypatch):
     [
         SquaredExponential(4, lengthscale=[0.5, 1.0, 2.0, 3.0], variance=2.0),
         Matern32(4),
-        Matern52(4),
         DeepKernel(Matern32(4), hidden=(8,), features=3),
         LinearKernel(4, slope_variance=[1.0, 2.0, 0.5, 3.0]),
         ActionLinearKernel(4, 2),

@@ -69,3 +69,59 @@ def test_a_level_that_is_none_is_refused(level):
         learner.interval(torch.zeros(2), level)
     with pytest.raises(ParameterError, match=r"in \(0, 1"):
         learner.quantile(torch.zeros(2), level)
+
+
+def test_intervals_hold_where_it_is_calm_and_where_it_is_noisy():
+    g = torch.Generator().manual_seed(0)
+    x = 2.0 * torch.rand(600, 1, generator=g, dtype=torch.float64) - 1.0
+    noise = 0.08 + 0.63 * (x + 1.0) / 2.0
+    y = torch.sin(3.0 * x) + noise * torch.randn(600, 1, generator=g, dtype=torch.float64)
+    learner = default_learner(1, 1)
+    held = []
+    for x_t, y_t in zip(x, y, strict=True):
+        held.append(bool((learner.predictive(x_t).cdf(y_t) - 0.5).abs() < 0.45))
+        learner.update(x_t, y_t)
+    order = noise[150:, 0].argsort()
+    thirds = torch.tensor(held[150:]).double()[order].reshape(3, -1).mean(-1)
+    assert bool(((thirds > 0.84) & (thirds < 0.96)).all()), thirds
+
+
+def test_local_noise_takes_no_part_where_noise_is_the_same_everywhere():
+    g = torch.Generator().manual_seed(1)
+    x = torch.randn(500, 3, generator=g, dtype=torch.float64)
+    learner = default_learner(3, 1)
+    learner.update(x, torch.randn(500, 1, generator=g, dtype=torch.float64))
+    assert float(learner.noise.log_factor(x).abs().mean()) < 0.05
+
+
+@pytest.mark.parametrize("observation", [False, True])
+@pytest.mark.parametrize("make", KINDS)
+def test_each_query_of_a_draw_has_the_predicted_law(make, observation):
+    learner, x = learned(make)
+    drawn = learner.sample(x[:2], 4000, observation=observation, generator=torch.Generator().manual_seed(0))
+    assert drawn.shape == (4000, 2, 2)
+    law = learner.predictive(x[:2]) if observation else learner.predict(x[:2])
+    rank = law.cdf(drawn)
+    for p in (0.1, 0.5, 0.9):
+        assert bool(((rank < p).double().mean(0) - p).abs().max() < 0.03)
+
+
+@pytest.mark.parametrize("fleet", [(), (2,)])
+@pytest.mark.parametrize("make", [RandomFeatureRLS, SparseOnlineGP, default_learner])
+def test_a_draw_is_one_function_of_all_queries(make, fleet):
+    learner, x = make(2, 2, batch_shape=fleet), learned(ZeroResidual)[1]
+    for x_t, y_t in zip(x, torch.sin(x), strict=True):
+        learner.update(x_t.expand(*fleet, 2), y_t.expand(*fleet, 2))
+    queries = torch.stack([x[0], x[0] + 1e-3, x[0] + 30.0]).reshape(3, *(1 for _ in fleet), 2)
+    drawn = learner.sample(queries, 500, generator=torch.Generator().manual_seed(0))
+    near, far = drawn[:, 0] - drawn[:, 1], drawn[:, 0] - drawn[:, 2]
+    assert drawn.shape == (500, 3, *fleet, 2)
+    assert bool((near.std(0) < 0.1 * drawn[:, 0].std(0)).all())
+    assert bool((far.std(0) > 0.5 * drawn[:, 0].std(0)).all())
+    again = learner.sample(queries, 500, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(drawn, again, atol=0, rtol=0)
+
+
+def test_an_impossible_number_of_draws_is_refused():
+    with pytest.raises(ParameterError, match="n = 0"):
+        ZeroResidual(2, 1).sample(torch.zeros(2), 0)

@@ -157,10 +157,12 @@ def test_new_sequence_carries_nothing_over():
 
 
 def test_a_fleet_is_so_many_single_mixtures():
-    x, y = noisy_pose(8, 120, 0.3)
+    n = 96
+    x, y = noisy_pose(8, n, 0.3)
     x, y = torch.stack([x, x.flip(0), 2 * x], 1), torch.stack([y, y.flip(0), -y], 1)
     generator = torch.Generator().manual_seed(0)
-    mask = torch.rand(120, 3, generator=generator) < 0.7
+    mask = torch.rand(n, 3, generator=generator) < 0.7
+    mask[:77] = True  # up to the last rebuild, which comes at the same step for all models
 
     def make(**options):
         gp = sogp(2, 1, capacity=10, parts=[RobustWeight(3.0)], **options)
@@ -170,7 +172,7 @@ def test_a_fleet_is_so_many_single_mixtures():
     fleet.update(x, y, mask)
     for i in range(3):
         single = make()
-        for t in range(120):
+        for t in range(n):
             single.update(x[t, i], y[t, i], mask[t, i])
         torch.testing.assert_close(single(x[:5, i]), fleet(x[:5])[:, i], atol=1e-10, rtol=0)
         law, laws = single.predictive(x[:5, i]), fleet.predictive(x[:5])

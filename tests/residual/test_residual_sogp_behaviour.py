@@ -25,7 +25,6 @@ from torch_ekm.residual import (
     RobustWeight,
     SquaredExponential,
     Standardize,
-    action_covariance,
 )
 from torch_ekm.residual.sparse_gp.engine import recursion
 
@@ -220,9 +219,6 @@ def test_wrong_widths_are_named():
         ActionLinearKernel(3, 3)
     with pytest.raises(ParameterError, match="lengthscale"):
         SquaredExponential(3, lengthscale=[1.0, 2.0])
-    gp = sogp(4, 2)
-    with pytest.raises(ParameterError, match="ActionLinearKernel"):
-        action_covariance(gp, torch.zeros(2))
 
 
 def test_skipped_samples_are_counted_and_leave_no_trace():

@@ -16,7 +16,6 @@ from ..residual import (
     Kernel,
     LinearKernel,
     Matern32,
-    Matern52,
     SquaredExponential,
 )
 from ..typing import Array, Tensor
@@ -72,7 +71,7 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
     if isinstance(kernel, LinearKernel):
         return _linear(kernel, basis, inputs)
     base: Any = kernel.base if isinstance(kernel, DeepKernel) else kernel
-    if type(base) not in (SquaredExponential, Matern32, Matern52):
+    if type(base) not in (SquaredExponential, Matern32):
         valid = "squared exponential, Matern, action-linear, linear or deep, and no subclass"
         raise ParameterError("kernel", type(base).__name__, valid)
     phi = _phi(base)
@@ -99,12 +98,10 @@ def _phi(kernel: Kernel) -> _Function:
     """Correlation at a squared scaled distance."""
     if isinstance(kernel, SquaredExponential):
         return lambda d2: ca.exp(-0.5 * d2)
-    root = math.sqrt(3.0 if isinstance(kernel, Matern32) else 5.0)
 
     def matern(d2: ca.SX) -> ca.SX:
-        r = root * ca.sqrt(ca.fmax(d2, _TINY))
-        value = 1.0 + r if isinstance(kernel, Matern32) else 1.0 + r + r * r / 3.0
-        return value * ca.exp(-r)
+        r = math.sqrt(3.0) * ca.sqrt(ca.fmax(d2, _TINY))
+        return (1.0 + r) * ca.exp(-r)
 
     return matern
 

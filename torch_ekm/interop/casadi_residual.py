@@ -11,6 +11,7 @@ from .._extras import require
 from ..exceptions import ParameterError, StateError
 from ..residual import MixtureResidual, ResidualLearner, SparseOnlineGP
 from ..residual.base import FARTHEST
+from ..residual.local_noise import REACH
 from ..typing import Array
 from .casadi_kernels import Inputs, covariance
 
@@ -117,6 +118,7 @@ def _mixture(learner: MixtureResidual, inputs: Inputs, variance: bool) -> _Expre
     carried = inputs.take("carried", lambda: learner.carried)
     share = inputs.take("weights", lambda: learner.weights)
     inflation = inputs.take("inflation", lambda: learner.inflation)
+    f, s = _build(learner.noise.gp, inputs, False), inputs.take("noise share", lambda: learner.noise.share())
     h = ca.DM(learner.shares.tolist()).T
     owner = ca.DM(learner.owner.tolist()).T  # (members, experts)
     one = ca.DM.ones(1, h.shape[1])
@@ -129,6 +131,7 @@ def _mixture(learner: MixtureResidual, inputs: Inputs, variance: bool) -> _Expre
         inside = (variances @ owner) * ca.repmat(h * h, means.shape[0], 1)
         spread = ca.sum2(beliefs * (inside + apart * apart))
         most = inflation * _weighted(share, [v + s for (_, v), s in zip(each, noises, strict=True)])
+        most = most * ca.exp(2.0 * s * ca.fmin(ca.fmax(f(x)[0], -REACH), REACH))
         return mean, ca.if_else(spread <= most, spread, most)
 
     return expression

@@ -7,11 +7,11 @@ from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
 from .baselines.replay_mlp import ReplayMLP
 from .baselines.zero import ZeroResidual
 from .default import default_learner
-from .kernels.action_linear import ActionLinearKernel, action_covariance
+from .kernels.action_linear import ActionLinearKernel
 from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel
 from .kernels.linear import LinearKernel
-from .kernels.stationary import Matern32, Matern52, SquaredExponential
+from .kernels.stationary import Matern32, SquaredExponential
 from .mixture import MixtureResidual
 from .mixture_engine import warm_up
 from .report import UpdateEvent, UpdateReport
@@ -34,7 +34,6 @@ __all__ = [
     "LearnHyperparameters",
     "LinearKernel",
     "Matern32",
-    "Matern52",
     "MixtureResidual",
     "Part",
     "ProcessNoise",
@@ -49,7 +48,6 @@ __all__ = [
     "UpdateEvent",
     "UpdateReport",
     "ZeroResidual",
-    "action_covariance",
     "default_learner",
     "warm_up",
 ]

@@ -1,33 +1,32 @@
-"""The contract of a learner: what every residual model is."""
+"""The contract of a learner: how every residual model learns, and what it is made of."""
 
 from __future__ import annotations
 
 import copy
 import math
-import pathlib
 import pickle
 import threading
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import nn
-from torch.distributions import Distribution, Normal
 
-from .._checks import check_count, check_counts, check_finite, check_share
+from .._checks import check_count, check_counts, check_finite
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError, StateError
 from ..typing import Bool, Float, Tensor
 from . import processes
-from .derivatives import recordable, value_and_jacobian
+from .derivatives import recordable
+from .predictions import Predictions
 from .report import UpdateReport
 
 #: times the largest |y| that was learned, beyond which no prediction goes
 FARTHEST = 2.0
 
 
-class ResidualLearner(Recorded, nn.Module, ABC):
+class ResidualLearner(Recorded, Predictions):
     """g(x), learned from a stream: ``y ~ N(g(x), R)``, and ``g = 0`` before the first sample.
 
     Shapes: a learner is a fleet of independent models of shape ``batch_shape`` (one model: ``()``).
@@ -84,56 +83,6 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         self.largest = nn.Buffer(torch.zeros(shape, dtype=self._kept, device=device))
         """Largest ``|y|`` that was learned, ``(*batch, out)``."""
 
-    # -- what a learner is ------------------------------------------------------------------
-
-    @abstractmethod
-    def forward(self, x: Float[Tensor, "*any in_features"]) -> Float[Tensor, "*all out_features"]:
-        """Posterior mean E[g(x)] in the units of y, differentiable in x."""
-
-    @abstractmethod
-    def predict(self, x: Float[Tensor, "*any in_features"], *, observation: bool = False) -> Normal:
-        """N(E[g(x)], Var[g(x)]), or the law of y = g(x) + noise with ``observation=True``."""
-
-    def predictive(self, x: Float[Tensor, "*any in_features"]) -> Distribution:
-        """Law of y, for log densities: ``predict`` with noise, unless a learner has a better one.
-
-        ``log_prob(y)``, ``cdf(y)`` and ``icdf(p)`` have the shape of y. Learners of heavy-tailed noise
-        override it.
-        """
-        return self.predict(x, observation=True)
-
-    def quantile(self, x: Float[Tensor, "*any in_features"], p: float) -> Float[Tensor, "*all out_features"]:
-        """What y stays below with probability p, of each output.
-
-        Raises:
-            ParameterError: p is not in (0, 1).
-        """
-        share = torch.as_tensor(check_share("p", p), dtype=self.dtype, device=self.device)
-        return self.predictive(x).icdf(share)
-
-    def interval(
-        self, x: Float[Tensor, "*any in_features"], level: float = 0.9
-    ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features"]]:
-        """Lower and upper end of what y lies in with probability ``level``, with equal tails, of each output.
-
-        Raises:
-            ParameterError: the level is not in (0, 1).
-        """
-        out = 0.5 - 0.5 * check_share("level", level)
-        return self.quantile(x, out), self.quantile(x, 1.0 - out)
-
-    def moments(
-        self, x: Float[Tensor, "*any in_features"], *, observation: bool = False
-    ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features"]]:
-        """Mean and variance of :meth:`predict`."""
-        law = self.predict(x, observation=observation)
-        return law.mean, law.variance
-
-    def both_moments(self, x: Float[Tensor, "*any in_features"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, variance of g and variance of y, see :meth:`moments`."""
-        mean, variance = self.moments(x)
-        return mean, variance, self.moments(x, observation=True)[1]
-
     def reset(self) -> None:
         """Forget all samples; hyperparameters stay as they are."""
         for buffer in self.buffers(recurse=False):
@@ -148,45 +97,6 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
         :meth:`update` calls it, under the lock and without autograd. Report with :meth:`UpdateReport.of`.
         """
-
-    def linearize(
-        self, x: Float[Tensor, "*any in_features"]
-    ) -> tuple[Float[Tensor, "*all out_features"], Float[Tensor, "*all out_features in_features"]]:
-        """``(g(x), dg/dx)``. Learners with a closed form override this autograd version."""
-        x = self.check_query(x)
-        mean, J = value_and_jacobian(self, x)
-        return mean, x.new_zeros(*mean.shape, x.shape[-1]) if J is None else J
-
-    def slope_deviation(
-        self, x: Float[Tensor, "*any in_features"]
-    ) -> Float[Tensor, "*all out_features in_features"]:
-        """Standard deviation of each entry of ``dg/dx``: what the slope of :meth:`linearize` is worth.
-
-        That of an input which never moved is large: nothing was seen of its slope. NaN: the learner states
-        none.
-        """
-        x = self.check_query(x)
-        return x.new_full((*x.shape[:-1], self.out_features, self.in_features), math.nan)
-
-    def export(self, path: str | pathlib.Path, *, format: Literal["onnx", "pt2"] = "pt2") -> pathlib.Path:
-        """Write what the learner predicts now to a file that other runtimes read, and return its path.
-
-        The input is ``x (n, in)``; the outputs are ``mean`` and latent ``variance`` ``(n, out)`` and their
-        derivatives ``mean_jacobian`` and ``variance_jacobian`` ``(n, out, in)``. What is learned later is
-        not in the file; where the learner goes on, see :func:`torch_ekm.interop.to_casadi`.
-
-        Args:
-            path: of the file.
-            format: ``"pt2"``, for ``torch.export.load`` and AOTInductor, or ``"onnx"`` (extra ``interop``).
-
-        Raises:
-            ParameterError: the learner has no closed-form Jacobians of mean and variance (a SparseOnlineGP
-                or a MixtureResidual of such has), or is a fleet; or an unknown format.
-            MissingExtraError: for ONNX, a package is missing.
-        """
-        from .export import export_learner  # torch's exporter is slow to import
-
-        return export_learner(self, path, format)
 
     # -- learning -----------------------------------------------------------------------------
 

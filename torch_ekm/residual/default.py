@@ -33,8 +33,9 @@ def default_learner(
 
     Two learners keep the past and learn features, of which one distrusts large samples and one does not (rare
     ones may be outliers, or what is worth learning); one lets g wander; one is linear in x and forgets.
-    The model alone, and the last residual alone, are among the experts. Evidence decides,
-    for each output. It predicts the *next* sample: see MixtureResidual.
+    The model alone, and the last residual alone, are among the experts. Evidence decides, for each output.
+    Noise may depend on x, and a system that comes back is known. It predicts the *next* sample: see
+    MixtureResidual.
 
     Args:
         capacity: basis vectors of each of the four.

@@ -9,10 +9,9 @@ from typing import Any, cast
 
 import torch
 from torch import nn
-from torch.distributions import Distribution, Normal
 
 from ..exceptions import ParameterError
-from ..typing import Float, Tensor
+from ..typing import AnyArray, Tensor
 from .base import ResidualLearner
 from .experts import (
     FARTHEST,
@@ -26,19 +25,24 @@ from .experts import (
     TREND_DECAY,
     YOUNG,
 )
+from .local_noise import LocalNoise
 from .mixture_engine import CompiledMixture
-from .printed import mixture
-from .report import MomentsWithJacobians, UpdateReport
+from .mixture_queries import MixtureQueries
+from .report import UpdateReport
+from .returns import Returns
+from .sparse_gp.monitor import COOL, DetectChanges
+from .sparse_gp.part import Host
 from .tails import MEMORY, ScaleMixture
 
 _SHARES = (0.0, 0.5, 1.0)  # values of h to choose from
 _CARRIES = (-0.3, 0.0, 0.2, 0.4, 0.6, 0.8)  # of kappa
 _CAPS = (3.0, 30.0)  # and of c
 _PRIOR = 0.8  # belief that a learner is to be taken at its word
+_BEHIND = 3.0  # log evidence that the others lack where a regime is back
 _SLOW = 0.2  # largest rate of a level that outlives the end of a trajectory
 
 
-class MixtureResidual(ResidualLearner):
+class MixtureResidual(MixtureQueries):
     """A weighted mean of experts e = (learner b, share h, carry kappa, level rho, trend beta, cap c)::
 
         mean_e = h m_b(x) - kappa w_e + l_e
@@ -46,8 +50,8 @@ class MixtureResidual(ResidualLearner):
         d_e <- .98 d_e + beta w_e,   l_e <- .995 l_e + rho w_e + d_e
         p_e ~ prior_e exp(sum_j memory^j log t_10(i_e(t-j) / s') - memory^t doubt_b)
 
-    s is the learners' deviation times the typical scale of ScaleMixture; s' is the larger of s and half the
-    running rms, at most 6 s; memory = 0.99.
+    s is the learners' deviation times ``r(x)`` of LocalNoise and the typical scale of ScaleMixture; s' is the
+    larger of s and half the running rms, at most 6 s; memory = 0.99.
 
     Differences of a noisy pose carry noise over: what one sample has too much, the next one lacks, so
     innovations correlate by up to -1/2 and ``kappa`` (the pose's share of the noise: the moving average
@@ -62,6 +66,9 @@ class MixtureResidual(ResidualLearner):
 
     It predicts the *next* sample: a constant carry is part of the mean until another sample comes.
     Call :meth:`new_sequence` where one trajectory ends and another begins.
+
+    Where the system changes and changes back, what the first learner that notes changes
+    (:class:`DetectChanges`) knew comes back after one or two samples, see Returns; not in a fleet.
 
     ``predict`` gives a Normal law whose variance is the running one; :meth:`predictive` a mixture of
     Student t laws, which heavy tails need (see ScaleMixture).
@@ -130,122 +137,12 @@ class MixtureResidual(ResidualLearner):
         self.count = nn.Buffer(torch.zeros(self.batch_shape, **factory))
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.tails = ScaleMixture(self.out_features, **fleet)
+        self.noise = LocalNoise(self.in_features, self.out_features, **fleet)
+        watched = Returns.watched(members)
+        self.watched = -1 if watched is None else watched
+        self.returns = None if watched is None else Returns(cast("Host", members[watched]))
         self._engine = CompiledMixture()
         self._settle()
-
-    # -- predictions ----------------------------------------------------------------------------
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Mean of all experts by their weights, ``sum_b gain_b m_b(x) + offset``."""
-        found = self._engine.ask(self, x)
-        if found is not None:
-            return found.mean
-        x = self.check_query(x)
-        return self._mean(torch.stack([learner(x).to(x.dtype) for learner in self.members], dim=-1))
-
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
-        if observation:
-            mean, deviation = self._standard(x)
-            return Normal(mean, deviation * self.inflation.sqrt(), validate_args=False)
-        found = self._engine.ask(self, x, "deviation")
-        if found is not None:
-            return Normal(found.mean, found.deviation, validate_args=False)
-        x = self.check_query(x)
-        each = [learner.both_moments(x) for learner in self.members]
-        mean, deviation, means = self._together([(m, v) for m, _, v in each])
-        deviation = deviation * self.inflation.sqrt()
-        variances = self._wide(torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype))
-        variance = self._spread(variances, self._apart(means, mean))
-        # y is measured: experts that disagree by more than y scatters do not know less of g than of y
-        return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
-
-    def predictive(self, x: Tensor) -> Distribution:
-        """Mixture of Student t laws about the mean: what log densities should be taken of."""
-        return self.tails.law(*self._standard(x))
-
-    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The learners' slopes, weighted; what is carried over does not depend on x."""
-        found = self._engine.ask(self, x, "jacobian")
-        if found is not None:
-            return found.mean, found.jacobian
-        x = self.check_query(x)
-        pairs = [learner.linearize(x) for learner in self.members]
-        means, slopes = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*pairs, strict=True))
-        slope = (self.gain.unsqueeze(-2) * _finite(slopes)).sum(-1)
-        return self.bounded_slope(self._sum(_finite(means)), slope)
-
-    def slope_deviation(self, x: Tensor) -> Tensor:
-        """``var = sum_e p_e (h_e^2 var_b + (h_e J_b - J)^2)``, within the experts' slopes and between."""
-        x = self.check_query(x)
-        J = _finite(torch.stack([learner.linearize(x)[1].to(x.dtype) for learner in self.members], dim=-1))
-        s = torch.stack([learner.slope_deviation(x).to(x.dtype) for learner in self.members], dim=-1)
-        p, h = self.mass.unsqueeze(-3), self._shares
-        apart = h * J.unsqueeze(-1) - (self.gain.unsqueeze(-2) * J).sum(-1)[..., None, None]
-        return (p * (h.square() * s.square().unsqueeze(-1) + apart.square())).sum((-2, -1)).sqrt()
-
-    def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
-        """Mean, variance (as :meth:`predict`) and both derivatives, from those of the learners::
-
-            d var/dx = sum_e p_e (h_e^2 dv_e/dx + 2 h_e (mean_e - mean) dm_e/dx)
-
-        Raises:
-            ParameterError: a learner does not give its own in closed form.
-        """
-        found = self._engine.ask(self, x, "variance", "jacobian", "slope")
-        if found is not None:
-            return MomentsWithJacobians(found.mean, found.variance, found.jacobian, found.slope)
-        x = self.check_query(x)
-        for learner in self.members:
-            if not hasattr(learner, "predict_with_jacobians"):
-                valid = "learners with predict_with_jacobians, such as SparseOnlineGP"
-                raise ParameterError("learners", type(learner).__name__, valid)
-        each = [cast("Any", learner).predict_with_jacobians(x) for learner in self.members]
-        m, v, dm, dv = (torch.stack(part, dim=-1).to(x.dtype) for part in zip(*each, strict=True))
-        m, v, dm, dv = _finite(m), self._wide(v), _finite(dm), _finite(dv)
-        noisy = torch.stack([learner.moments(x, observation=True)[1] for learner in self.members], dim=-1)
-        mean, jacobian = self.bounded_slope(self._sum(m), (self.gain.unsqueeze(-2) * dm).sum(-1))
-        apart, p, h = self._apart(m, mean), self.mass, self._shares
-        variance = self._spread(v, apart)
-        of_v, of_m = p @ h.square(), 2.0 * (p * apart) @ h
-        slope = (of_v.unsqueeze(-2) * dv).sum(-1) + (of_m.unsqueeze(-2) * dm).sum(-1)
-        share, inflation = self.weights, self.inflation
-        most = inflation * (share * self._wide(noisy.to(x.dtype))).sum(-1)
-        steepest = inflation.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1)
-        return MomentsWithJacobians(
-            mean,
-            torch.minimum(variance, most),
-            jacobian,
-            torch.where((variance <= most).unsqueeze(-1), slope, steepest),
-        )
-
-    @property
-    def members(self) -> list[ResidualLearner]:
-        """The learners b in the order in which they were given."""
-        return cast("list[ResidualLearner]", list(self.learners))
-
-    @property
-    def weights(self) -> Float[Tensor, "*batch out learners"]:
-        """Posterior probability of each learner, independent of its share."""
-        return self.mass.sum(-1)
-
-    @property
-    def shares(self) -> Float[Tensor, " experts"]:
-        """Share h of its learner's mean that each expert takes."""
-        return self._experts[0]
-
-    @property
-    def beliefs(self) -> Float[Tensor, "*batch out experts"]:
-        """Posterior probability p of each expert, by output."""
-        return (self.prior + self.evidence).softmax(-1)
-
-    @property
-    def carried(self) -> Float[Tensor, "*batch out experts"]:
-        """What each expert adds to its learner's mean: ``l - kappa w``."""
-        return self.level - self._experts[1] * self.innovation
-
-    def __repr__(self) -> str:
-        return "\n  ".join([f"{type(self).__name__}({self.extra_repr()})", *mixture(self)])
 
     # -- learning -------------------------------------------------------------------------------
 
@@ -259,6 +156,9 @@ class MixtureResidual(ResidualLearner):
         self.evidence.copy_(self.first_evidence)
         self.inflation.fill_(1.0)
         self.tails.reset()
+        self.noise.reset()
+        if self.returns is not None:
+            self.returns.reset()
         self._settle()
 
     @torch.no_grad()
@@ -288,8 +188,12 @@ class MixtureResidual(ResidualLearner):
         report = self._engine.learn(self, x, y, mask)
         if report is not None:
             return report
-        nis = self._judged(y, mask, [learner.moments(x, observation=True) for learner in self.members])
+        moments = [learner.moments(x, observation=True) for learner in self.members]
+        nis, *said = self._judged(x, y, mask, moments)
         reports = [learner.step(x, y, mask) for learner in self.members]
+        if self.returns is not None and (mask is None or bool(mask)):
+            figures = y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis), self.has_changed()
+            self.note_return(x, *figures)
         part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
             (part * torch.stack(each, dim=-1).to(part)).sum(-1)
@@ -298,11 +202,37 @@ class MixtureResidual(ResidualLearner):
         event = torch.stack([one.event for one in reports]).amax(0)
         return UpdateReport(event, novelty, nis, weight)
 
+    def has_changed(self) -> bool:
+        """Whether the learner that notes changes started again at the last sample."""
+        changes = cast("Host", self.learners[self.watched]).part(DetectChanges)
+        return changes is not None and float(changes.level) == COOL
+
+    def note_return(self, x: Tensor, y: AnyArray, said: AnyArray, nis: float, changed: bool) -> None:
+        """After a sample of one model: a regime that is back takes its learner's place, see Returns."""
+        if self.returns is None:
+            return
+        i = self.watched
+        if not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis, changed):
+            return
+        best = self.owner[:, i] > 0
+        for experts, most in ((best, 0.0), (~best, -_BEHIND)):
+            if bool(experts.any()):
+                own = self.evidence[..., experts]
+                self.evidence[..., experts] = (own - own.amax(-1, keepdim=True) + most).clamp_min(LEAST)
+        self.new_sequence()
+
     # -- pieces ---------------------------------------------------------------------------------
 
-    def _judged(self, y: Tensor, mask: Tensor | None, moments: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-        """Evidence, what is carried over, variance and tails after one sample per model; returns the nis."""
+    def _judged(
+        self, x: Tensor, y: Tensor, mask: Tensor | None, moments: Sequence[tuple[Tensor, Tensor]]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Evidence, what is carried over, variance and tails after one sample per model.
+
+        Returns:
+            The nis, and of the law before: its mean and typical deviation.
+        """
         mean, deviation, means = self._together(moments)
+        deviation = deviation * self.noise.log_factor(x).exp().to(deviation)
         # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
         # heeds the few large samples of a stream that mostly rests, too
         typical = self.tails.typical()
@@ -334,23 +264,11 @@ class MixtureResidual(ResidualLearner):
             on = judged[(..., *(None,) * (value.dim() - judged.dim()))]
             buffer.copy_(torch.where(on, value, buffer))
         nis = (z.square() / self.inflation).mean(-1)
+        self.noise.observe(x, z / typical, judged)
         self.tails.observe(z, (self.count - YOUNG).clamp_min(0.0), judged)
         self.count += 1.0 if mask is None else mask.to(self.count.dtype)
         self._settle()
-        return nis
-
-    def _mean(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out"]:
-        return self.bounded(self._sum(_finite(means)))
-
-    def _sum(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out"]:
-        return (self.gain * means).sum(-1) + self.offset
-
-    def _wide(self, variances: Float[Tensor, "*any out learners"]) -> Tensor:
-        """A learner whose variance is not finite knows as little as the spread of y."""
-        return variances.where(variances.isfinite(), self.largest.square().unsqueeze(-1).to(variances))
-
-    def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
-        return self.shares * (means @ self.owner.mT) + self.carried
+        return nis, mean, deviation * typical
 
     def _settle(self) -> None:
         """What queries need of the beliefs."""
@@ -360,33 +278,6 @@ class MixtureResidual(ResidualLearner):
         self.spread.copy_((p * (carried - self.shift.unsqueeze(-1)).square()).sum(-1))
         self.gain.copy_(self.mass @ self._shares)
         self.offset.copy_((self.mass * self.shift).sum((-2, -1)))
-
-    def _apart(self, means: Tensor, mean: Tensor) -> Float[Tensor, "*any out learners shares"]:
-        """How far the experts of each learner and share are from the mixture's mean, in their mean."""
-        return self._shares * means.unsqueeze(-1) + self.shift - mean[..., None, None]
-
-    def _spread(self, variances: Tensor, apart: Tensor) -> Float[Tensor, "*any out"]:
-        """Variance of g: within the experts, and between them."""
-        inside = self._shares.square() * variances.unsqueeze(-1)
-        return (self.mass * (inside + apart.square()) + self.spread).sum((-2, -1))
-
-    def _standard(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean, and the deviation by which innovations are standardised (the learners' own)."""
-        found = self._engine.ask(self, x, "standard")
-        if found is not None:
-            return found.mean, found.standard
-        x = self.check_query(x)
-        return self._together([learner.moments(x, observation=True) for learner in self.members])[:2]
-
-    def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
-        means, variances = (torch.stack(part, dim=-1).to(self.dtype) for part in zip(*moments, strict=True))
-        means = _finite(means)
-        return self._mean(means), (self.weights * self._wide(variances)).sum(-1).sqrt(), means
-
-
-def _finite(values: Tensor) -> Tensor:
-    """A learner that is not finite has no say: what it says counts as 0, the model alone."""
-    return values.nan_to_num(0.0, 0.0, 0.0)
 
 
 def _bounded(z: Tensor) -> Tensor:

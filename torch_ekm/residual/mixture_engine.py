@@ -78,18 +78,20 @@ class CompiledMixture:
         bound = self._takes(g, x)
         if bound is None or not is_plain_one(y, (*g.batch_shape, g.out_features)):
             return None
-        x, y, plans, members = x.contiguous(), y.contiguous(), self._plans, self._learners
+        x, y, plans, learners = x.contiguous(), y.contiguous(), self._plans, self._learners
         loops: Any = load_loops()
         if not loops.are_finite(bound.row, x.data_ptr(), y.data_ptr()):
             return None
-        n, m, k = len(bound.all), g.out_features, len(plans)
-        means, noisy = np.empty((n * m, k)), np.empty((n * m, k))
-        figures, events, errors = np.zeros((k, 4, n)), np.zeros((k, n), np.int64), np.zeros((k, n, m))
-        of_all = np.empty((3, n))
+        n, m, k = len(bound.all), g.out_features, len(plans) - 1
+        (means, noisy), local = np.empty((2, n * m, k)), np.empty(n * m)
+        figures, events, errors = (
+            np.zeros((k + 1, 4, n)), np.zeros((k + 1, n), np.int64), np.zeros((k + 1, n, m))
+        )  # fmt: skip
+        of_all, said, judged = np.empty((3, n)), np.empty((2, n * m)), np.empty(n, np.bool_)
         if mask is not None:
             figures[:, 2] = 1.0
         turns = []
-        for i, (plan, learner) in enumerate(zip(plans, members, strict=True)):
+        for i, (plan, learner) in enumerate(zip(plans, learners, strict=True)):
             if plan is None:
                 mean, variance = learner.moments(x, observation=True)
                 means[:, i], noisy[:, i] = mean.reshape(-1).numpy(), variance.reshape(-1).numpy()
@@ -98,28 +100,37 @@ class CompiledMixture:
                 plan.units is not None and plan.units.acts_before(learner.n_samples, learner)
             )
             turns.append(_SKIP if apart else learner.engine.begin(learner, x, y, mask))
-        on = on_array(bound, mask)
         alarm = loops.update_mixture(
-            bound.row, self._members, np.array(turns), on, x.data_ptr(), y.data_ptr(), means, noisy, figures,
-            events, errors, of_all,
+            bound.row, self._members, np.array(turns), on_array(bound, mask), judged, x.data_ptr(),
+            y.data_ptr(), means, noisy, local, local.ctypes.data, said, figures, events, errors, of_all,
         )  # fmt: skip
         done_apart = False
-        for i, (plan, learner) in enumerate(zip(plans, members, strict=True)):
+        for i, (plan, learner) in enumerate(zip(plans, learners, strict=True)):
+            t, on = y, mask
+            if i == k:
+                if not alarm >> k:
+                    break
+                t, on = (
+                    torch.from_numpy(a.reshape(s)) for a, s in ((local, y.shape), (judged, g.batch_shape))
+                )
             if turns[i] is not _SKIP:
                 assert plan is not None
-                learner.engine.finish(
-                    learner, x, y, mask, bool(alarm >> i & 1), figures[i], events[i], errors[i]
-                )
+                facing = i < k and bool(alarm >> i & 1)
+                learner.engine.finish(learner, x, t, on, facing, figures[i], events[i], errors[i])
                 continue
-            done_apart = True
-            report = learner.step(x, y, mask)
-            events[i], figures[i, 0] = report.event.reshape(-1), report.novelty.reshape(-1)
-            figures[i, 2] = report.weight.reshape(-1)
+            report = learner.step(x, t, on)
+            if i < k:
+                done_apart = True
+                events[i], figures[i, 0] = report.event.reshape(-1), report.novelty.reshape(-1)
+                figures[i, 2] = report.weight.reshape(-1)
         if done_apart:
             part = g.weights.mean(-2).reshape(n, k).T.numpy()
-            of_all[1], of_all[2] = (part * figures[:, 0]).sum(0), (part * figures[:, 2]).sum(0)
+            of_all[1], of_all[2] = (part * figures[:k, 0]).sum(0), (part * figures[:k, 2]).sum(0)
+        if g.returns is not None and (mask is None or bool(mask)):
+            changed = alarm >> g.watched & 1 or (turns[g.watched] is _SKIP and g.has_changed())
+            g.note_return(x, y.numpy(), said, float(of_all[0, 0]), bool(changed))
         nis, novelty, weight = torch.from_numpy(of_all.reshape(3, *g.batch_shape)).unbind()
-        event = torch.from_numpy(events.max(0).reshape(tuple(g.batch_shape)))
+        event = torch.from_numpy(events[:k].max(0).reshape(tuple(g.batch_shape)))
         return UpdateReport(event, novelty, nis, weight)
 
     # -- what they work on ----------------------------------------------------------------------
@@ -132,16 +143,13 @@ class CompiledMixture:
             return None
         if self._bound is None or not self._bound.is_current():
             self._bound = self._bind(g)
-            self._learners = g.members
-        plans = [
-            one.engine.of(one) if isinstance(getattr(one, "engine", None), CompiledEngine) else None
-            for one in self._learners
-        ]
+            self._learners, self._noise = [*g.members, g.noise.gp], _plan(g.noise.gp)
+        plans = [*map(_plan, self._learners[:-1]), self._noise]  # nobody else changes the GP of the noise
         if plans != self._plans:
             self._plans = plans
             none = np.zeros(P.FIELDS, np.int64)
             self._members = np.stack([none if plan is None else plan.row for plan in plans])
-        return self._bound if self._bound.usable else None
+        return self._bound if self._bound.usable and plans[-1] is not None else None
 
     def _bind(self, g: Any) -> Bound:
         bound, tails = Bound(), g.tails
@@ -152,9 +160,10 @@ class CompiledMixture:
             G.MASS: g.mass, G.SHIFT: g.shift, G.SPREAD: g.spread, G.OFFSET: g.offset,
             G.INFLATION: g.inflation, G.COUNT: g.count, G.RATES: tails.rates,
             G.FREEDOMS: tails.freedoms, G.TAIL_SCALE: tails.log_scale,
-            G.TAIL_EVIDENCE: tails.evidence,
+            G.TAIL_EVIDENCE: tails.evidence, G.NOISE_EVIDENCE: g.noise.evidence,
+            G.NOISE_SHARES: g.noise.shares,
         }  # fmt: skip
-        bound.watch((g, tails), g._modules, g.learners._modules)
+        bound.watch((g, tails, g.noise), g._modules, g.learners._modules, g.noise._modules)
         bound.usable = all(
             t.is_cpu and t.is_contiguous() and t.dtype == torch.float64 for t in fields.values()
         )
@@ -166,6 +175,12 @@ class CompiledMixture:
         row[G.N_TAILS], row[G.AT_ZERO] = len(tails.rates), bound.own(at_zero.numpy().copy())
         bound.all = np.ones(row[P.MODELS], np.bool_)
         return bound
+
+
+def _plan(learner: Any) -> Plan | None:
+    """What compiled loops know of a learner; None: nothing."""
+    engine = getattr(learner, "engine", None)
+    return engine.of(learner) if isinstance(engine, CompiledEngine) else None
 
 
 _SKIP = P.SKIP, -1, -1, -1, -1, 0

@@ -10,5 +10,5 @@ from .sparse_gp import plan as P
     EXPERTS,  # rows h, kappa, rho, beta, c, a column for each expert, those of the first learner first
     PRIOR, EVIDENCE, INNOVATION, LEVEL, TREND, GAIN, MASS, SHIFT, SPREAD, OFFSET, INFLATION, COUNT,
     RATES, FREEDOMS, AT_ZERO,  # of the tails' laws, and their log density at 0
-    TAIL_SCALE, TAIL_EVIDENCE, FIELDS,
-) = range(P.FIELDS, P.FIELDS + 22)  # fmt: skip
+    TAIL_SCALE, TAIL_EVIDENCE, NOISE_EVIDENCE, NOISE_SHARES, FIELDS,
+) = range(P.FIELDS, P.FIELDS + 24)  # fmt: skip

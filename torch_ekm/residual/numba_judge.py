@@ -13,11 +13,14 @@ import numpy as np
 from numba import njit, types
 
 from . import experts as E
+from . import local_noise as L
 from . import mixture_plan as G
 from .base import FARTHEST as FARTHEST_MEAN
 from .sparse_gp import plan as P
-from .sparse_gp.engine.numba_math import A1, I1, INNER, INT, TINY, F, exp, log, matrix_at, vector_at
+from .sparse_gp.engine.numba_math import A1, A2, I1, INNER, INT, TINY, F, exp, log, matrix_at, vector_at
 from .tails import LARGEST, MEMORY
+
+_N = len(L.SHARES)
 
 
 @njit(F(F), **INNER)
@@ -26,16 +29,16 @@ def _bounded(z):
 
 
 @njit(F(A1, A1), **INNER)
-def _typical(log_scale, evidence):
-    """See ``ScaleMixture.typical``."""
+def _believed(values, evidence):
+    """Their mean, weighted by evidence."""
     most, total, mean = -np.inf, 0.0, 0.0
     for t in range(evidence.shape[0]):
         most = max(most, evidence[t])
     for t in range(evidence.shape[0]):
         p = math.exp(evidence[t] - most)
         total += p
-        mean += p * log_scale[t]
-    return math.exp(mean / total)
+        mean += p * values[t]
+    return mean / total
 
 
 @njit(types.void(I1, INT, F, F), **INNER)
@@ -57,6 +60,28 @@ def _follow_tails(g, o, z, since):
         log_scale[t] = min(max(moved, -LARGEST), LARGEST)
     for t in range(n):
         evidence[t] -= most
+
+
+@njit(F(I1, INT), **INNER)
+def share_of_noise(g, o):
+    """s of LocalNoise."""
+    return _believed(vector_at(g[G.NOISE_SHARES], 0, _N), vector_at(g[G.NOISE_EVIDENCE], o, _N))
+
+
+@njit(F(I1, INT, F, F), **INNER)
+def _target_of_noise(g, o, size, f):
+    """What f learns of a log innovation, after its evidence, see ``LocalNoise.observe``."""
+    n, most = _N, -np.inf
+    shares, evidence = vector_at(g[G.NOISE_SHARES], 0, n), vector_at(g[G.NOISE_EVIDENCE], o, n)
+    for s in range(n):
+        log_scale = shares[s] * f
+        z2 = math.exp(2.0 * (size - log_scale))
+        evidence[s] = L.MEMORY * evidence[s] - log_scale
+        evidence[s] -= 0.5 * (L.FREEDOM + 1.0) * math.log1p(z2 / L.FREEDOM)
+        most = max(most, evidence[s])
+    for s in range(n):
+        evidence[s] -= most
+    return math.log(min(math.exp(size - f), L.MOST) + L.FLOOR) + L.CENTRE + f
 
 
 @njit(types.void(I1, INT, F, A1, A1), **INNER)
@@ -155,19 +180,27 @@ def make_finite(g, o, means, variances):
         variances[i] = variances[i] if math.isfinite(variances[i]) else most * most
 
 
-@njit(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1), **INNER)
-def judge(g, o, y, judged, since, means, noisy, far, p):
-    """One output of one model: how far y lies from each expert's mean, and what follows; returns the nis."""
+@njit(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1, A1, A2), **INNER)
+def judge(g, o, y, judged, since, means, noisy, far, p, local, said):
+    """One output of one model: how far y lies from each expert's mean, and what follows; returns the nis.
+
+    ``local``: f of LocalNoise for each output, which becomes what it is to learn; ``said``: room for the
+    mean and typical deviation.
+    """
     n, n_learners = g[G.N_EXPERTS], means.shape[0]
     each, inflation = n // n_learners, vector_at(g[G.INFLATION], o, 1)
     experts, most = matrix_at(g[G.EXPERTS], 0, 5, n), FARTHEST_MEAN * vector_at(g[P.LARGEST], o, 1)[0]
     h, kappa = experts[0], experts[1]
-    mean, deviation = min(max(mean_of(g, o, means), -most), most), math.sqrt(scatter_of(g, o, noisy))
-    z = _bounded((y - mean) / deviation)
+    f = min(max(local[o], -L.REACH), L.REACH)
+    log_factor = share_of_noise(g, o) * f
+    mean = min(max(mean_of(g, o, means), -most), most)
+    deviation = math.sqrt(scatter_of(g, o, noisy)) * math.exp(log_factor)
+    z, tails = _bounded((y - mean) / deviation), g[G.N_TAILS]
+    log_scale = vector_at(g[G.TAIL_SCALE], o, tails)
+    typical = math.exp(_believed(log_scale, vector_at(g[G.TAIL_EVIDENCE], o, tails)))
+    scale = deviation * typical
+    said[0, o], said[1, o] = mean, scale
     if judged:
-        tails = g[G.N_TAILS]
-        typical = _typical(vector_at(g[G.TAIL_SCALE], o, tails), vector_at(g[G.TAIL_EVIDENCE], o, tails))
-        scale = deviation * typical
         width = min(max(E.RMS_LEAST * math.sqrt(inflation[0]) / typical, 1.0), E.RMS_MOST)
         w, level = vector_at(g[G.INNOVATION], o, n), vector_at(g[G.LEVEL], o, n)
         for i in range(n_learners):
@@ -185,5 +218,6 @@ def judge(g, o, y, judged, since, means, noisy, far, p):
         square = min(z * z, E.SQUARE_MOST * inflation[0])
         rate = max(1.0 / (since + 2.0), E.RATE)
         inflation[0] = max(inflation[0] + rate * (square - inflation[0]), 1e-12)
+        local[o] = _target_of_noise(g, o, math.log(max(abs(z) / typical, TINY)) + log_factor, f)
         _follow_tails(g, o, z, since)
     return z * z / inflation[0]

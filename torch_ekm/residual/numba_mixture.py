@@ -3,8 +3,8 @@
 Equations and names are those of :class:`~torch_ekm.residual.MixtureResidual` and
 :class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a row of
 :mod:`~torch_ekm.residual.mixture_plan`, ``members`` has one row of
-:mod:`~torch_ekm.residual.sparse_gp.plan` for each learner; of another kind of learner it is 0, and what it
-predicts is given.
+:mod:`~torch_ekm.residual.sparse_gp.plan` for each learner, and one for the GP of LocalNoise; of another kind
+of learner it is 0, and what it predicts is given.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import numpy as np
 from numba import njit, types
 
 from . import experts as E
+from . import local_noise as L
 from . import mixture_plan as G
 from .base import FARTHEST as FARTHEST_MEAN
-from .numba_judge import judge, make_finite, mean_of, scatter_of
+from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
-from .sparse_gp.engine.numba_math import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
+from .sparse_gp.engine.numba_math import A1, A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
 
 are_finite, query_fleet, update_fleet = gp.are_finite, gp.query_fleet, gp.update_fleet
 
@@ -28,7 +29,7 @@ are_finite, query_fleet, update_fleet = gp.are_finite, gp.query_fleet, gp.update
 @njit(types.void(I1, A3, A2), **INNER)
 def _of_all(g, figures, of_all):
     """Novelty and weight of a sample, by the say of each learner."""
-    m, n_learners = g[P.OUT], figures.shape[0]
+    m, n_learners = g[P.OUT], figures.shape[0] - 1
     n_groups = n_learners * g[G.N_SHARES]
     for b in range(g[P.MODELS]):
         of_all[1, b] = of_all[2, b] = 0.0
@@ -40,30 +41,36 @@ def _of_all(g, figures, of_all):
                 of_all[2, b] += mass[k] * figures[i, 2, b] / m
 
 
-@njit(INT(I1, I2, I2, ON, INT, INT, A2, A2, A3, I2, A3, A2), **COMMON)
-def update_mixture(g, members, turns, on, x, y, means, noisy, figures, events, errors, of_all):
+@njit(INT(I1, I2, I2, ON, ON, INT, INT, A2, A2, A1, INT, A2, A3, I2, A3, A2), **COMMON)
+def update_mixture(
+    g, members, turns, on, judged_on, x, y, means, noisy, local, local_address, said, figures, events,
+    errors, of_all,
+):  # fmt: skip
     """One sample per model where ``on``: all learners predict, the mixture judges them, they learn.
 
     Args:
         turns: what each learner does, see its plan.
         x, y: addresses.
+        judged_on: where the mixture judged, and so the noise learned.
+        local: room for what the noise learns, at that address.
+        said: room for mean and typical deviation of y, ``(2, models out)``.
         means, noisy: of y, from learners of other kinds, ``(models out, learners)``.
         figures, events, errors: see ``update_fleet``, one for each learner.
         of_all: nis, novelty and weight of the mixture, ``(3, models)``; the last two where all learned here.
 
     Returns:
-        A bit for each learner of which a model faces another system.
+        A bit for each learner of which a model faces another system, and one that the noise learned.
     """
-    B, d, m, n_learners = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0]
+    B, d, m, n_learners = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
     far, p, inside = np.empty(g[G.N_EXPERTS]), np.empty(g[G.N_EXPERTS]), np.empty(m)
     mean, noise, t, found = np.empty(m), np.empty(m), np.empty(m), np.empty(4)
     total = 0
-    for i in range(n_learners):
+    for i in range(n_learners + 1):
         if members[i, P.MODELS]:
             total += B * (gp.values_of(members[i]) + members[i, P.WIDTH] + 2 * members[i, P.SLOTS] + 1)
-    room, at = np.empty(total), 0  # what is found for predictions serves the update
+    room, at, alarm = np.empty(total), 0, 0  # what is found for predictions serves the update
     gp.grow_largest(g, on, y)
-    for i in range(n_learners):
+    for i in range(n_learners + 1):
         a = members[i]
         if not a[P.MODELS]:
             continue
@@ -75,11 +82,15 @@ def update_mixture(g, members, turns, on, x, y, means, noisy, figures, events, e
             prior = gp.look(a, b, vector_at(x, b, d), values, q, k, psi, phi)
             v = gp.mean_and_variance(a, b, prior, k, Ck, mean)
             gp.cut(a, b, mean, inside)
-            gp.noise_of(a, b, noise)
-            scale = vector_at(a[P.SCALE_Y], b * a[P.OWN_UNITS], m)
-            for o in range(m):
-                means[b * m + o, i] = mean[o]
-                noisy[b * m + o, i] = v * scale[o] * scale[o] + noise[o]
+            if i == n_learners:
+                for o in range(m):
+                    local[b * m + o] = mean[o]
+            else:
+                gp.noise_of(a, b, noise)
+                scale = vector_at(a[P.SCALE_Y], b * a[P.OWN_UNITS], m)
+                for o in range(m):
+                    means[b * m + o, i] = mean[o]
+                    noisy[b * m + o, i] = v * scale[o] * scale[o] + noise[o]
             room[at + n + W + 2 * M] = prior
             at += n + W + 2 * M + 1
     for b in range(B):
@@ -88,28 +99,36 @@ def update_mixture(g, members, turns, on, x, y, means, noisy, figures, events, e
             make_finite(g, r, means[r], noisy[r])
             judged = on[b] and count[0] >= E.YOUNG
             since = max(count[0] - E.YOUNG, 0.0)
-            nis += judge(g, r, vector_at(y, r, 1)[0], judged, since, means[r], noisy[r], far, p) / m
+            nis += (
+                judge(g, r, vector_at(y, r, 1)[0], judged, since, means[r], noisy[r], far, p, local, said) / m
+            )
+        judged_on[b] = judged
+        alarm |= int(judged) << n_learners
         if on[b]:
             count[0] += 1.0
         of_all[0, b] = nis
-    at, alarm = 0, 0
-    for i in range(n_learners):
-        a = members[i]
+    at = 0
+    for i in range(n_learners + 1):
+        a, learned, on_ = members[i], y, on
+        if i == n_learners:
+            learned, on_ = local_address, judged_on
+            if not alarm >> n_learners & 1:
+                break
         if not a[P.MODELS]:
             continue
         n, W, M = gp.values_of(a), a[P.WIDTH], a[P.SLOTS]
         for b in range(B):
             values, q = room[at : at + n], room[at + n : at + n + W]
             k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
-            if on[b] and turns[i, P.MODE] != P.SKIP:
+            if on_[b] and turns[i, P.MODE] != P.SKIP:
                 prior = room[at + n + W + 2 * M]
                 events[i, b] = gp.learn(
-                    a, b, values, q, k, Ck, prior, vector_at(y, b, m), t, found, errors[i, b]
+                    a, b, values, q, k, Ck, prior, vector_at(learned, b, m), t, found, errors[i, b]
                 )
                 for r in range(4):
                     figures[i, r, b] = found[r]
             at += n + W + 2 * M + 1
-        if gp.note(a, turns[i], on, x, y, figures[i], errors[i]):
+        if gp.note(a, turns[i], on_, x, learned, figures[i], errors[i]):
             alarm |= 1 << i
     _of_all(g, figures, of_all)
     return alarm
@@ -124,16 +143,23 @@ def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
         standard: deviation of y by which innovations are standardised.
         J, dv: derivatives of mean and variance by x.
     """
-    B, d, m, n = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0]
+    B, d, m, n = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
     n_shares, n_experts = g[G.N_SHARES], g[G.N_EXPERTS]
     with_variance, rows = variance != 0 or deviation != 0 or standard != 0, m if J else 0
     rows_dv = m if dv else 0
     h = matrix_at(g[G.EXPERTS], 0, 5, n_experts)[0]
     each = n_experts // (n * n_shares)
     means, latent, noisy = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
-    J_of, dv_of = np.empty((n, rows, d)), np.empty((n, rows_dv, d))
-    one, v, noise = np.empty(m), np.empty(m), np.zeros(m)
+    J_of, dv_of = np.empty((n + 1, rows, d)), np.empty((n, rows_dv, d))
+    one, v, noise, log_factor, none = np.empty(m), np.empty(m), np.zeros(m), np.zeros(m), np.empty((0, d))
     for b in range(B):
+        if with_variance:
+            gp.query(members[n], b, False, vector_at(x, b, d), log_factor, v, J_of[n, :rows_dv], none)
+            for o in range(m):
+                share = share_of_noise(g, b * m + o)
+                for j in range(d if rows_dv else 0):
+                    J_of[n, o, j] *= share if abs(log_factor[o]) < L.REACH else 0.0
+                log_factor[o] = share * min(max(log_factor[o], -L.REACH), L.REACH)
         for i in range(n):
             gp.query(members[i], b, with_variance, vector_at(x, b, d), one, v, J_of[i], dv_of[i])
             if with_variance:
@@ -164,23 +190,25 @@ def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
                 i, share = k // n_shares, h[k * each]
                 apart = share * means[o, i] + shift[k] - value
                 total += mass[k] * (share * share * latent[o, i] + apart * apart) + spread[k]
-            scatter = scatter_of(g, r, noisy[o])
-            bound = scatter * vector_at(g[G.INFLATION], r, 1)[0]
+            scatter, factor = scatter_of(g, r, noisy[o]), math.exp(log_factor[o])
+            by_noise = vector_at(g[G.INFLATION], r, 1)[0] * factor * factor
+            bound = by_noise * scatter
             if standard:
-                vector_at(standard, r, 1)[0] = math.sqrt(scatter)
+                vector_at(standard, r, 1)[0] = math.sqrt(scatter) * factor
             if deviation:
                 vector_at(deviation, r, 1)[0] = math.sqrt(min(total, bound))
             if variance:
                 vector_at(variance, r, 1)[0] = min(total, bound)
             if rows_dv:
                 to = vector_at(dv, r, d)
-                to[:] = 0.0
+                for j in range(d):
+                    to[j] = 2.0 * bound * J_of[n, o, j] if total > bound else 0.0
                 for k in range(n * n_shares):
                     i, share = k // n_shares, h[k * each]
                     apart = share * means[o, i] + shift[k] - value
                     by_v, by_m = mass[k] * share * share, 2.0 * mass[k] * apart * share
                     if total > bound:
-                        by_v, by_m = mass[k] * vector_at(g[G.INFLATION], r, 1)[0], 0.0
+                        by_v, by_m = mass[k] * by_noise, 0.0
                     for j in range(d):
                         s, f = dv_of[i, o, j], J_of[i, o, j]
                         to[j] += by_v * (s if math.isfinite(s) else 0.0) + by_m * (

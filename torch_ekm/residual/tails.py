@@ -52,6 +52,24 @@ class ScaleMixtureLaw(MixtureSameFamily):
             low, high = torch.where(below, half, low), torch.where(below, high, half)
         return 0.5 * (low + high)
 
+    def placed(
+        self, z: Float[Tensor, "*n_and_any"], generator: torch.Generator | None
+    ) -> Float[Tensor, "*n_and_any"]:
+        """Draws ``mean + s z / sqrt(chi2 / nu)`` of this law, whose normal parts z are given."""
+        t: Any = self.component_distribution
+        shares = self.mixture_distribution.probs.expand(t.batch_shape).flatten(0, -2)
+        e = torch.multinomial(shares, len(z), True, generator=generator).mT.reshape(z.shape)
+        freedoms = t.df.flatten(0, -2)[0]
+        shape, factory = (*z.shape, int(freedoms.max()) // 2), {"dtype": z.dtype, "device": z.device}
+        uniform = torch.rand(shape, generator=generator, **factory).clamp_min(torch.finfo(z.dtype).tiny)
+        chi2 = -2.0 * uniform.log().cumsum(-1)  # of 2, 4, .. freedoms
+        nu, scale = freedoms[e], t.scale.expand(len(z), *t.batch_shape)
+        chi2, scale = (
+            one.gather(-1, place.unsqueeze(-1)).squeeze(-1)
+            for one, place in ((chi2, (0.5 * nu).long() - 1), (scale, e))
+        )
+        return t.loc[..., 0] + scale * z * (nu / chi2).sqrt()
+
 
 class ScaleMixture(nn.Module):
     """Experts e on standardised innovations z, each a Student t whose scale follows the score::

@@ -12,6 +12,7 @@ from torch import nn
 from ..._checks import check_count, check_fraction, check_positive
 from ...typing import Bool, Float, Tensor
 from ..kernels.kernel import log_parameter
+from ..predictions import joint_draws
 from ..report import UpdateReport
 from ..running_scale import BLOCK
 from .scaled import ScaledLearner
@@ -75,6 +76,13 @@ class LinearInFeatures(ScaledLearner):
         phi = self.features(z).unsqueeze(-2)
         v = (phi @ self.covariance @ phi.mT).squeeze(-1).clamp_min(torch.finfo(phi.dtype).tiny)
         return (phi @ self.weights).squeeze(-2), v + self.noise_variance if observation else v
+
+    def unit_draws(self, x: Tensor, n: int, generator: torch.Generator | None) -> Tensor:
+        """From the covariance ``phi' P phi`` of the queries."""
+        z = self._inputs(x).reshape(-1, *self.batch_shape, self.in_features).movedim(0, -2)
+        phi = self.features(z)
+        draws = joint_draws(phi @ self.covariance @ phi.mT, n, self.out_features, generator)
+        return draws.reshape(n, *x.shape[:-1], self.out_features)
 
     @abstractmethod
     def _feature_slopes(self, z: Tensor) -> Float[Tensor, "*any f in"]:

@@ -85,6 +85,16 @@ class ReplayMLP(ScaledLearner, SingleLearner):
             return mean, v + self.noise if observation else v
         return mean, self.noise.expand_as(mean)
 
+    def unit_draws(self, x: Tensor, n: int, generator: torch.Generator | None) -> Tensor:
+        """Members' functions, mixed; one network knows of each query alone."""
+        if self.members == 1 or not self.count:
+            return super().unit_draws(x, n, generator)
+        apart = self._members(self._inputs(x))
+        apart = (apart - apart.mean(-2, keepdim=True)) / apart.std(-2, keepdim=True)
+        shape = n, *(1,) * (x.dim() - 1), self.members, self.out_features
+        mix = torch.randn(shape, generator=generator, dtype=x.dtype, device=x.device)
+        return (mix * apart.nan_to_num(0.0)).sum(-2) / (self.members - 1) ** 0.5
+
     def _clear(self, models: Tensor | None = None) -> None:
         """New weights from the seed, empty memory."""
         for buffer in (self.inputs, self.targets, self.count):

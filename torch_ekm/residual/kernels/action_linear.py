@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 
 from ..._checks import check_count
-from ...exceptions import ParameterError, ShapeError
-from ...typing import Float, Tensor
+from ...exceptions import ParameterError
+from ...typing import Tensor
 from .kernel import Kernel, log_parameter
 from .stationary import SquaredExponential
 
@@ -99,32 +98,3 @@ class ActionLinearKernel(Kernel):
 
     def grows(self, in_features: int) -> list[bool]:
         return self.state_kernel.grows(self.state_features) + [True] * self.action_features
-
-
-def action_covariance(learner: Any, s: Float[Tensor, "*any n_s"]) -> Float[Tensor, "*any out n_a n_a"]:
-    """V(s) with ``var(s, a)_j = a' V_j(s) a`` exactly::
-
-        V = k_s(s, s) Lambda + B'CB,   B_i = k_s(s, s_i) Lambda a_i
-
-    Args:
-        learner: a SparseOnlineGP with an ActionLinearKernel.
-
-    Raises:
-        ParameterError: it has another kernel.
-        ShapeError: the state has another width.
-    """
-    kernel = getattr(learner, "kernel", None)
-    if not isinstance(kernel, ActionLinearKernel) or not hasattr(learner, "posterior"):
-        valid = "a SparseOnlineGP with an ActionLinearKernel"
-        raise ParameterError("learner", f"{type(learner).__name__} with {type(kernel).__name__}", valid)
-    posterior = learner.posterior
-    s = torch.as_tensor(s, dtype=posterior.basis.dtype, device=posterior.basis.device)
-    if s.shape[-1:] != (kernel.state_features,):
-        raise ShapeError("s", f"(*any, {kernel.state_features})", s.shape)
-    z = learner.units.inputs(s)
-    sz, az = kernel.split(posterior.basis)
-    B = kernel.state_kernel.vector(z, sz).unsqueeze(-1) * (az * kernel.action_variance.unsqueeze(-2))
-    prior = torch.diag_embed(kernel.state_kernel.diagonal(z).unsqueeze(-1) * kernel.action_variance)
-    V = prior + B.mT @ (posterior.covariance @ B)
-    V = learner.units.curvature(V.unsqueeze(-3))
-    return V.expand(*V.shape[:-3], learner.out_features, *V.shape[-2:]).to(learner.dtype)

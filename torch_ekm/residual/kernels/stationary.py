@@ -164,13 +164,3 @@ class Matern32(StationaryKernel):
         r = (3.0 * d2.clamp_min(_TINY)).sqrt()
         decay = torch.exp(-r)
         return (1.0 + r) * decay, 3.0 * decay
-
-
-class Matern52(StationaryKernel):
-    """``k = v (1 + sqrt(5) r + 5/3 r^2) exp(-sqrt(5) r)``, ``r = |x - z|_L``."""
-
-    @staticmethod
-    def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
-        r = (5.0 * d2.clamp_min(_TINY)).sqrt()
-        decay = torch.exp(-r)
-        return (1.0 + r + r * r / 3.0) * decay, (5.0 / 3.0) * (1.0 + r) * decay

@@ -17,7 +17,7 @@ CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
 Z90_SQUARED = 1.6448536269514722**2
 RATE = 1 / 8  #: of the shares of samples that do not fit
 RING_SIZE = 24  # samples kept, of which those since the change are replayed
-ALARM, LARGE, _ONSET, _COOL = 0.6, 5.0, 0.12, -2.0
+ALARM, LARGE, _ONSET, COOL = 0.6, 5.0, 0.12, -2.0
 FACTOR_LEAST, FACTOR_MOST = -5.0, 10.0  # logarithms
 DISTRUSTED, DISTRUSTED_MOST = 0.25, 0.6  #: shares of distrusted samples
 
@@ -141,7 +141,7 @@ class DetectChanges(Part):
             changed = changed | misled
             learner.units.forget(misled)
         if bool(changed.any()):
-            self.level.masked_fill_(changed, _COOL)
+            self.level.masked_fill_(changed, COOL)
             x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
             later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
             learner.start_anew(changed, x, y, later & levels.isfinite())

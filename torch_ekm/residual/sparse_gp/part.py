@@ -78,14 +78,6 @@ class Units:
         slope = slope * _power(self.output.scale, power).unsqueeze(-1) / by
         return slope * self.input.follows(z).unsqueeze(-2) if self.input.cuts else slope
 
-    def curvature(self, curvature: Float[Tensor, "*any out_or_1 columns columns"]) -> Tensor:
-        """The second derivative of a variance by the last columns of x."""
-        if self.input is None or self.output is None:
-            return curvature
-        inverse = 1.0 / self.input.scale[..., self.input.scale.shape[-1] - curvature.shape[-1] :]
-        scaled = curvature * (inverse.unsqueeze(-1) * inverse.unsqueeze(-2)).unsqueeze(-3)
-        return scaled * self.output.scale.square()[..., None, None]
-
     def affine(self) -> tuple[Tensor, ...]:
         """Buffers (shift, scale) of x, then of y, for compiled loops, which change in place; or ``()``."""
         if self.input is None or self.output is None:

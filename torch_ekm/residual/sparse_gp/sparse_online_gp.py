@@ -11,6 +11,7 @@ from ..._checks import check_count
 from ...typing import Float, Tensor
 from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import Matern32
+from ..predictions import joint_draws
 from ..printed import sparse_gp
 from ..report import MomentsWithJacobians, UpdateReport
 from .defaults import chosen_parts
@@ -145,6 +146,14 @@ class SparseOnlineGP(Host):
     def slope_deviation(self, x: Tensor) -> Tensor:
         """Root of ``d2k(x, z)/dx dz + (dk/dx)' C dk/dx`` at ``z = x``, by column."""
         return self.engine.slope_deviation(self, x)
+
+    def unit_draws(self, x: Tensor, n: int, generator: torch.Generator | None) -> Tensor:
+        """From the covariance ``K(x, x') + k' C k'`` of the queries."""
+        z = self.units.inputs(x).reshape(-1, *self.batch_shape, self.in_features).movedim(0, -2)
+        k = self.kernel(z, self.posterior.basis) * self.posterior.active.unsqueeze(-2)
+        covariance = self.kernel(z, z) + k @ self.posterior.covariance @ k.mT
+        draws = joint_draws(covariance, n, self.out_features, generator)
+        return draws.reshape(n, *x.shape[:-1], self.out_features).to(self.dtype)
 
     def predict_with_jacobians(self, x: Float[Tensor, "*any in"]) -> MomentsWithJacobians:
         """Mean, latent variance and both derivatives, in closed form.

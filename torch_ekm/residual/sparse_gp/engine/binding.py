@@ -17,7 +17,7 @@ from ...kernels.action_linear import ActionLinearKernel
 from ...kernels.deep import DeepKernel
 from ...kernels.kernel import Kernel
 from ...kernels.linear import LinearKernel
-from ...kernels.stationary import Matern32, Matern52, SquaredExponential
+from ...kernels.stationary import Matern32, SquaredExponential
 from .. import plan as P
 from ..forgetting import ForgettingFactor, ProcessNoise
 from ..hyperparameters import LearnHyperparameters
@@ -30,7 +30,7 @@ _PARTS = (
     Standardize, RobustWeight, DetectChanges, CalibrateNoise, LearnHyperparameters, ForgettingFactor,
     ProcessNoise,
 )  # fmt: skip
-_KINDS = {SquaredExponential: 0, Matern32: 1, Matern52: 2}  # as numba_kernels has them
+_KINDS = {SquaredExponential: 0, Matern32: 1}  # as numba_kernels has them
 
 
 class Bound:

@@ -21,6 +21,7 @@ _SOURCES = (
     "sparse_gp/monitor.py",
     "**/recursion.py",
     "experts.py",
+    "local_noise.py",
     "tails.py",
     "misled.py",
 )

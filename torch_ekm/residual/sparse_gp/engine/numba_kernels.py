@@ -22,7 +22,7 @@ from .numba_math import A1, A2, A3, EPS, I1, INNER, INT, TINY, F, exp
 from .recursion import LEAST_NOVELTY, TIE, TIE_KL
 
 #: what a kernel's ``kind`` means
-SQUARED_EXPONENTIAL, MATERN32, MATERN52 = 0, 1, 2
+SQUARED_EXPONENTIAL, MATERN32 = 0, 1
 _FAR = 1e10  # squared scaled distance beyond which a kernel is 0
 
 
@@ -38,7 +38,7 @@ def _correlations(kind, variance, active, k, psi):
             k[i] = variance * exp(-0.5 * k[i])
         for i in range(n):
             psi[i] = k[i]
-    elif kind == MATERN32:
+    else:
         for i in range(n):
             k[i] = math.sqrt(3.0 * k[i])
         for i in range(n):
@@ -46,15 +46,6 @@ def _correlations(kind, variance, active, k, psi):
         for i in range(n):
             k[i] = (1.0 + k[i]) * psi[i]
             psi[i] *= 3.0
-    else:
-        for i in range(n):
-            k[i] = math.sqrt(5.0 * k[i])
-        for i in range(n):
-            psi[i] = variance * exp(-k[i])
-        for i in range(n):
-            r = k[i]
-            k[i] = (1.0 + r + r * r / 3.0) * psi[i]
-            psi[i] *= (5.0 / 3.0) * (1.0 + r)
     for i in range(n):
         k[i] = k[i] if active[i] != 0.0 else 0.0
         psi[i] = psi[i] if active[i] != 0.0 else 0.0

@@ -1,0 +1,126 @@
+"""Regimes that come back: a learner's state before each change is kept, and taken again where it fits."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from ..typing import AnyArray, Tensor
+from .base import ResidualLearner
+from .experts import FREEDOM
+from .sparse_gp.monitor import DetectChanges
+from .sparse_gp.part import Host
+
+_KEPT = 2  # regimes
+_EVERY = 64  # samples between two copies of the present state
+_REST = 32  # samples after a change or a return in which there is neither a copy nor a return
+_CALM = -0.5, 0.12  # level of DetectChanges at which a copy is of one regime alone
+_MEMORY, _ENOUGH, _MOST = 0.9, 8.0, 10.0  # of log evidence: forgotten, that a regime is back, of one sample
+_SURPRISE = 3.0  # nis from which on old regimes are asked
+
+
+class Returns(nn.Module):
+    """Old states of a learner that notes changes of the system, for a mixture of one model::
+
+        a_j <- max(0, .9 a_j + min(10, c(mean)) - c(mean_j)),   c(mean) = sum 11/2 log(1 + z^2/10)
+
+    c sums over the outputs, z is the error of the mixture's mean, or of the j-th state's, in the mixture's
+    typical deviations. Where a_j exceeds 8 the learner and the j-th state change places: one or two samples
+    suffice. A copy of the state is made every 64 samples while all goes well, so that a change, which is
+    noticed samples later, does not spoil what is kept. Two regimes are kept; the older one goes.
+
+    Args:
+        learner: whose states are kept.
+    """
+
+    def __init__(self, learner: Host) -> None:
+        super().__init__()
+        self.states = nn.ModuleList(copy.deepcopy(learner) for _ in range(_KEPT + 1))  # the last: the copy
+        self.reset()
+
+    @staticmethod
+    def watched(learners: list[ResidualLearner]) -> int | None:
+        """Place of the first learner that notes changes, if there is one of one model."""
+        noting = (i for i, one in enumerate(learners) if isinstance(one, Host) and one.part(DetectChanges))
+        return None if learners[0].batch_shape else next(noting, None)
+
+    def reset(self) -> None:
+        """No regime is known."""
+        self.evidence: list[float] = []
+        self.is_copied, self.n, self.rest = False, 0, _REST
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """What is known of the states."""
+        known = {name: getattr(self, name) for name in ("is_copied", "n", "rest")}
+        return {**known, "evidence": list(self.evidence)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """See :meth:`get_extra_state`."""
+        for name, value in state.items():
+            setattr(self, name, list(value) if name == "evidence" else value)
+
+    def observe(
+        self, learner: Host, x: Tensor, y: AnyArray, said: AnyArray, nis: float, changed: bool
+    ) -> bool:
+        """Take note of a sample that was learned; whether the learner is in an old state from now on.
+
+        Args:
+            changed: whether the learner has started again.
+            said: mean of the mixture before, and its typical deviation, ``(2, out)``.
+        """
+        known = vars(self)  # an assignment to a Module takes ten times as long
+        known["n"], known["rest"] = self.n + 1, max(self.rest - 1, 0)
+        if not (changed or self.evidence or self.n % _EVERY == 0):
+            return False
+        states = self.states
+        if self.evidence and (nis > _SURPRISE or any(self.evidence)):
+            j = self._judge(x, y, said)
+            if self.evidence[j] > _ENOUGH and not self.rest:
+                copy_state(states[_KEPT], learner)
+                copy_state(learner, states[j])
+                states[j], states[_KEPT] = states[_KEPT], states[j]
+                known |= {"evidence": [0.0] * len(self.evidence), "is_copied": False, "rest": _REST}
+                return True
+        if changed and self.is_copied:
+            kept, new = list(states[:_KEPT]), states[_KEPT]
+            at = len(self.evidence)
+            order = [*kept[:at], new, *kept[at:]] if at < _KEPT else [*kept[1:], new, kept[0]]
+            for place, state in enumerate(order):
+                states[place] = state
+            known |= {"evidence": [0.0] * min(at + 1, _KEPT), "is_copied": False, "rest": _REST}
+        elif self.n % _EVERY == 0 and not self.rest and _is_calm(learner):
+            known["is_copied"] = True
+            copy_state(states[_KEPT], learner)
+        return False
+
+    def _judge(self, x: Tensor, y: AnyArray, said: AnyArray) -> int:
+        """The state that fits best, after this sample."""
+        most = min(_cost(y, said[0], said[1]), _MOST)
+        for j, before in enumerate(self.evidence):
+            mean = self.states[j](x).cpu().numpy()
+            self.evidence[j] = max(0.0, _MEMORY * before + most - _cost(y, mean, said[1]))
+        return int(np.argmax(self.evidence))
+
+
+def _is_calm(learner: Host) -> bool:
+    changes = learner.part(DetectChanges)
+    return changes is not None and _CALM[0] < float(changes.level) < _CALM[1]
+
+
+def _cost(y: AnyArray, mean: AnyArray, deviation: AnyArray) -> float:
+    z2 = ((y - mean) / deviation) ** 2
+    return float(0.5 * (FREEDOM + 1.0) * np.log1p(z2 / FREEDOM).sum())
+
+
+@torch.no_grad()
+def copy_state(to: nn.Module, of: nn.Module) -> None:
+    """All that a learner has learned, into another one of its make."""
+    for new, old in zip(to.buffers(), of.buffers(), strict=True):
+        new.copy_(old)
+    for new, old in zip(to.modules(), of.modules(), strict=True):
+        if type(old).get_extra_state is not nn.Module.get_extra_state:
+            new.set_extra_state(old.get_extra_state())
