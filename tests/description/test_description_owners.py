@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description import HandDescription, load_hand, load_object, write_template
+from torch_ekm.description.held import unheld_joints
 from torch_ekm.description.urdf import inertia_problem, read_urdf
 from torch_ekm.exceptions import DescriptionError
 from torch_ekm.kinematics import HandKinematics
@@ -153,12 +154,20 @@ def test_a_template_asks_for_the_hand_alone(tmp_path: Path) -> None:
         write_template(path, "plam")
 
 
+def test_all_joints_that_nothing_holds_are_named() -> None:
+    """However little they move against each other."""
+    rows, springs = np.array([[1.0, 100.0, 0.0, 0.0]]), np.diag([0.0, 0.0, 0.2, 0.0])
+    assert unheld_joints("abcd", rows, springs) == ["a", "b", "d"]
+    assert unheld_joints("ab", np.zeros((0, 2)), np.eye(2)) == []
+
+
 # -- MJCF -------------------------------------------------------------------------------------------
 
 MESHES = """
 <mujoco model="a">
   <option collision="all" gravity="0 0 -9.81"/>
   <default>
+    <default class="ball"><geom mesh="knuckle"/><default class="inner"/></default>
     <default class="seen"><geom type="mesh" contype="0" conaffinity="0"/>
       <default class="knuckle"><geom mesh="knuckle"/></default>
       <default class="pad"><geom type="box" size="0.001 0.002 0.003" contype="1"/></default>
@@ -168,7 +177,7 @@ MESHES = """
   <worldbody>
     <body name="near" pos="0 0 0.02" childclass="knuckle">
       <joint name="near" axis="0 1 0" range="0 90" stiffness="0.1"/>
-      <geom/><geom class="pad"/><geom class="seen" mesh="knuckle"/>
+      <geom/><geom class="inner"/><geom class="pad"/><geom class="seen" mesh="knuckle"/>
       <geom class="seen" type="capsule" size="0.006" fromto="0 0 0 0 0 0.04" contype="1"/>
       <body name="far" childclass="pad"><geom pos="0 0 0.01"/></body>
     </body>
