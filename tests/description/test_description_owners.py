@@ -135,10 +135,16 @@ def test_a_fixed_base_keeps_the_joints_that_the_file_names(tmp_path: Path) -> No
     robot(tmp_path, OF_THE_HAND.replace("[joints]", "[joints]\nknee = { spring = 1 }"), fixed)
     hand = load_hand(tmp_path / "robot.urdf")
     assert (hand.joint_names, hand.urdf.root, hand.base_link) == (("near", "far", "knee"), "base", "palm")
-    # a frame that carries nothing is one of the whole hand
-    assert load_hand(robot(tmp_path, OF_THE_HAND, fixed)).joint_names == ("near", "far")
-    tip = OF_THE_HAND.replace('base_link = "palm"', 'base_link = "column"')
-    assert load_hand(robot(tmp_path, tip, fixed)).urdf.root == "column"
+
+
+def test_a_base_link_may_be_a_frame_of_the_palm(tmp_path: Path) -> None:
+    """One that carries nothing: the hand is what the palm carries, in that frame."""
+    frame = '<link name="frame"/><joint name="f" type="fixed"><parent link="palm"/><child link="frame"/>'
+    text = ROBOT.replace("</robot>", frame + '<origin xyz="0.01 0.02 0.03"/></joint></robot>')
+    hand = load_hand(robot(tmp_path, OF_THE_HAND.replace('"palm"', '"frame"'), text))
+    assert (hand.joint_names, hand.urdf.root, hand.base_link) == (("near", "far"), "palm", "frame")
+    palm = HandKinematics(hand)(torch.zeros(2, dtype=torch.float64)).of("palm")
+    torch.testing.assert_close(palm[:3, 3], torch.tensor([-0.01, -0.02, -0.03], dtype=torch.float64))
 
 
 def test_a_template_asks_for_the_hand_alone(tmp_path: Path) -> None:
