@@ -1,6 +1,6 @@
 """The iCub's hand as its public URDF has it, cut out of a robot, beside the one of this package (iKin's).
 
-Figures: robotology/icub-models @dca8c618, iCub_manual, iCubGazeboV2_5_visuomanip, links r_hand to r_hand_*_tip
+Figures: robotology/icub-models @dca8c618, iCub_manual, iCubGazeboV2_5_visuomanip, r_hand to r_hand_*_tip
 (CC BY-SA 4.0), and gazebo-yarp-plugins @f837061b, ControlBoardDriverCoupling.cpp, for what the motors move.
 """
 
@@ -42,7 +42,7 @@ LIMITS = {
     "little_0": (0, 20),
 }  # [deg]
 # largest distance between both models' fingertips over all angles [mm], rounded up to 0.1
-APART = {"thumb": 4.6, "index": 3.6, "middle": 2.9, "ring": 11.3, "little": 10.6}
+APART = {"thumb": 4.8, "index": 3.6, "middle": 2.9, "ring": 11.4, "little": 10.7}
 
 
 def public_hand(folder: Path) -> HandDescription:
@@ -84,8 +84,9 @@ def public_hand(folder: Path) -> HandDescription:
 def test_the_public_hand_is_cut_out_and_its_difference_stated(tmp_path: Path) -> None:
     public, ours = public_hand(tmp_path), load_hand("icub_right")
     assert public.joint_names == ours.joint_names
-    q = torch.from_numpy(np.random.default_rng(0).uniform(ours.joint_lower, ours.joint_upper, (2000, 20)))
-    q[0] = 0.0
+    shares = torch.cartesian_prod(*[torch.linspace(0.0, 1.0, 7, dtype=torch.float64)] * 4).repeat(1, 5)
+    q = torch.from_numpy(ours.joint_lower) + shares * torch.from_numpy(ours.joint_upper - ours.joint_lower)
+    q = torch.cat([torch.zeros_like(q[:1]), q])  # extended, and all angles of each finger
     theirs = q.clone()
     theirs[:, ours.joint_names.index("index_0")] *= -1  # it counts the other way
     there, here = HandKinematics(public)(theirs), HandKinematics(ours)(q)
