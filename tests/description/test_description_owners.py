@@ -210,7 +210,7 @@ def test_a_mesh_that_a_class_names_is_left_out(tmp_path: Path) -> None:
 CARRIED = """
 <mujoco model="carried">
   <include file="../scene.xml"/>
-  <compiler angle="radian"/>
+  <compiler angle="radian" settotalmass="2"/>
   <option gravity="0 0 -9.81"/>
   <worldbody>
     <body name="thing">
@@ -220,7 +220,7 @@ CARRIED = """
       <joint name="rail" type="slide" axis="1 0 0" ref="0.05"/>
       <joint name="elbow" axis="0 1 0" range="-1 1" ref="0.1"/><geom size="0.01"/>
       <body name="palm" pos="0 0 0.2" euler="0.5 0 0.6">
-        <joint name="wrist" axis="1 0 0" range="-1 1"/><geom size="0.01"/>
+        <joint name="wrist" axis="1 0 0" range="-1 1"/><geom type="ellipsoid" size="0.01 0.02 0.03"/>
         <body name="finger" pos="0.03 0 0">
           <joint name="near" axis="0 1 0" range="0 1.5" stiffness="0.1"/><geom name="finger" size="0.01"/>
           <body name="tip" pos="0 0 0.04">
@@ -234,6 +234,7 @@ CARRIED = """
     <fixed name="flexor"><joint joint="near" coef="0.01"/><joint joint="far" coef="0.005"/>
       <joint joint="rail" coef="1"/></fixed>
   </tendon>
+  <equality><weld body1="thing"/></equality>
   <actuator>
     <position name="rail" joint="rail" kp="100" ctrlrange="0 1"/>
     <position name="elbow" joint="elbow" kp="100" ctrlrange="-1 1"/>
@@ -253,8 +254,19 @@ def test_carrying_slides_are_held_and_things_left_out(tmp_path: Path) -> None:
         "hands have hinges; joints of other kinds are held: rail",
         "actuators that drive no joint of the hand are left out: rail",
         "these move and nothing drives them: they are left out: thing",
+        "shapes other than box, sphere, capsule and cylinder touch nothing, those of: palm",
         "motors of tendons count in the angle of a pulley, of their largest arm: pull (10 mm)",
     )
+
+
+def test_the_mass_that_a_file_sets_is_the_hands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the things'; without MuJoCo's complaint in a file."""
+    monkeypatch.chdir(tmp_path)
+    hand = read(tmp_path, CARRIED.replace('settotalmass="2"', ""))
+    shares = [link.mass for link in hand.urdf.links]
+    for link, share in zip(read(tmp_path, CARRIED).urdf.links, shares, strict=True):
+        assert link.mass == pytest.approx(2 * share / (sum(shares) + 1000 * 4 / 3 * np.pi * 0.02**3))
+    assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
 def test_a_motor_in_metres_of_tendon_counts_in_an_angle(tmp_path: Path) -> None:

@@ -25,9 +25,10 @@ _BUILDS = {"attach", "composite", "replicate"}  # bodies that do not stand in th
 _ATTRIBUTES = ("material", "user")  # that are not read, ...
 _SETTINGS = {  # ... and of elements that only set something, all that is
     "option": {"gravity"},
+    "default": {"class"},
     "compiler": {
         "angle", "autolimits", "boundinertia", "boundmass", "eulerseq", "inertiafromgeom",
-        "inertiagrouprange", "settotalmass",
+        "inertiagrouprange",
     },
 }  # fmt: skip
 _MESHES = ("mesh", "hfield", "sdf")  # types of a geom
@@ -51,12 +52,16 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
         if element.tag in _READ:
             strict.append(element)
     notes = [listed("files outside the folder are not read", reader.left_out)] if reader.left_out else []
+    meshes, total = _take_out_meshes(strict), ""
+    for element in strict.iter():
+        total = element.get("settotalmass", total)
+        _strip(path, element)
     mujoco = require("mujoco")
     try:
-        meshes = _take_out_meshes(strict)
-        for element in strict.iter():
-            _strip(path, element)
-        return mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode")), meshes, notes
+        model = mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode"))
+        if total:  # MuJoCo complains of the attribute
+            mujoco.mj_setTotalmass(model, float(total))
+        return model, meshes, notes
     except RecursionError:
         raise DescriptionError(path, "elements are nested too deep") from None
     except (ValueError, RuntimeError) as error:

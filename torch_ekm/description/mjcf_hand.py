@@ -169,9 +169,7 @@ class _Conversion:
             return Shape("sphere", (x / 2,), place)
         if kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
             return Shape("capsule" if kind == kinds.mjGEOM_CAPSULE else "cylinder", (x / 2, y), place)
-        self.notes.append(
-            f"a shape of '{link}' is neither box, sphere, capsule nor cylinder: it touches nothing"
-        )
+        self._note("shapes other than box, sphere, capsule and cylinder touch nothing, those of", link)
         return None
 
     def _rotation(self, quaternion: Array) -> Array:
@@ -324,6 +322,8 @@ class _Conversion:
         for e in range(model.neq):
             kind, name = int(model.eq_type[e]), model.equality(e).name or f"equality_{e}"
             if kind != kinds.mjEQ_JOINT and kind != kinds.mjEQ_TENDON:
+                if not any(self._moves(e, end) for end in (model.eq_obj1id[e], model.eq_obj2id[e])):
+                    continue  # what carries the hand, or the rest of the robot
                 raise DescriptionError(
                     self.path, f"equality '{name}' closes a loop: only joints and tendons are tied"
                 )
@@ -338,6 +338,13 @@ class _Conversion:
                 row, value = row - slope * other, value - slope * there
             if row.any():
                 yield name, row, value
+
+    def _moves(self, equality: int, end: int) -> bool:
+        """Whether a joint of the hand moves a body, or a site's body."""
+        of_site = int(self.model.eq_objtype[equality]) == self._mj.mjtObj.mjOBJ_SITE
+        body = int(self.model.site_bodyid[end] if of_site else end)
+        name = self.model.body(body).name or f"body_{body}"
+        return any(joint.kind != "fixed" for joint in self.urdf.joints_to(name))
 
     def _tied(self, kind: int, which: int, actuated: set[int]) -> tuple[Array, float]:
         """The row of a joint or tendon under an equality, and its value where MuJoCo counts from."""
