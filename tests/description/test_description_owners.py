@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description import HandDescription, load_hand, load_object, write_template
-from torch_ekm.description.held import unheld_joints
+from torch_ekm.description.mimic import unheld_joints
 from torch_ekm.description.urdf import inertia_problem, read_urdf
 from torch_ekm.exceptions import DescriptionError
 from torch_ekm.kinematics import HandKinematics
@@ -252,9 +252,9 @@ def test_carrying_slides_are_held_and_things_left_out(tmp_path: Path) -> None:
     assert hand.notes == (
         "files outside the folder are not read: ../scene.xml",
         "hands have hinges; joints of other kinds are held: rail",
-        "actuators that drive no joint of the hand are left out: rail",
         "these move and nothing drives them: they are left out: thing",
         "shapes other than box, sphere, capsule and cylinder touch nothing, those of: palm",
+        "actuators that drive no joint of the hand are left out: rail",
         "motors of tendons count in the angle of a pulley, of their largest arm: pull (10 mm)",
     )
 

@@ -22,15 +22,13 @@ _NOT_READ = {  # of elements that are
     "camera", "light", "plugin", "flag", "material", "texture", "hfield", "skin", "flexcomp", "numeric",
 }  # fmt: skip
 _BUILDS = {"attach", "composite", "replicate"}  # bodies that do not stand in the file
+_BOUNDS = {"boundmass": "1e-6", "boundinertia": "1e-12", "balanceinertia": "true"}  # least, kg and kg m^2
 _ATTRIBUTES = ("material", "user")  # that are not read, ...
 _SETTINGS = {  # ... and of elements that only set something, all that is
     "option": {"gravity"},
     "default": {"class"},
-    "compiler": {
-        "angle", "autolimits", "boundinertia", "boundmass", "eulerseq", "inertiafromgeom",
-        "inertiagrouprange",
-    },
-}  # fmt: skip
+    "compiler": {"angle", "autolimits", "eulerseq", "inertiafromgeom", "inertiagrouprange"} | _BOUNDS.keys(),
+}
 _MESHES = ("mesh", "hfield", "sdf")  # types of a geom
 
 
@@ -47,19 +45,19 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
     reader = _read(path)
     root = reader.root
     strict = ET.Element("mujoco", model=root.get("model", path.stem))
-    ET.SubElement(strict, "compiler", boundmass="1e-6", boundinertia="1e-12", balanceinertia="true")
+    ET.SubElement(strict, "compiler", _BOUNDS)
     for element in root:
         if element.tag in _READ:
             strict.append(element)
     notes = [listed("files outside the folder are not read", reader.left_out)] if reader.left_out else []
-    meshes, total = _take_out_meshes(strict), ""
+    meshes, total = _take_out_meshes(strict), "-1"
     for element in strict.iter():
         total = element.get("settotalmass", total)
         _strip(path, element)
     mujoco = require("mujoco")
     try:
         model = mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode"))
-        if total:  # MuJoCo complains of the attribute
+        if float(total) > 0:  # MuJoCo complains of the attribute
             mujoco.mj_setTotalmass(model, float(total))
         return model, meshes, notes
     except RecursionError:

@@ -187,10 +187,8 @@ class _Conversion:
     def _tables(self, name: str) -> dict[str, Any]:
         actuated: set[int] = set()
         actuators = [self._actuator(k, actuated) for k in range(self.model.nu)]
-        idle = [self.model.actuator(k).name or f"actuator_{k}" for k, a in enumerate(actuators) if a is None]
-        if idle and self.whole:
-            self.notes.append(listed("actuators that drive no joint of the hand are left out", idle))
-        drives = [self._row(actuator["moment_arms"]) for actuator in actuators if actuator is not None]
+        actuators = [actuator for actuator in actuators if actuator is not None]
+        drives = [self._row(actuator["moment_arms"]) for actuator in actuators]
         couplings = list(self._equalities(actuated))
         for coupling in self._tendon_couplings(actuated):
             rows = [*drives, *(row for _, row, _ in couplings), coupling[1]]
@@ -214,7 +212,6 @@ class _Conversion:
         }
         tables = [{"name": label, "joints": self._named(row)} for label, row, _ in couplings]
         hand = {"name": name, "base_link": self.base, "gravity": (self.gravity + 0.0).tolist()}
-        actuators = [actuator for actuator in actuators if actuator is not None]
         return {"hand": hand, "joints": springs, "actuators": actuators, "couplings": tables}
 
     def _rests(self, couplings: list[tuple[str, Array, float]]) -> Array:
@@ -231,6 +228,8 @@ class _Conversion:
         name = model.actuator(k).name or f"actuator_{k}"
         row, offset = self._driven(k, actuated)
         if not row.any():
+            if self.whole:
+                self._note("actuators that drive no joint of the hand are left out", name)
             return None
         length = self._span(row) + offset
         gain, bias = float(model.actuator_gainprm[k, 0]), float(model.actuator_biasprm[k, 1])

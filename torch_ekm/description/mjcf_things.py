@@ -30,18 +30,11 @@ def things(model: Any, bodies: Iterable[int]) -> set[int]:
 
 
 def _driven(model: Any) -> set[int]:
-    """Bodies on the world of which an actuator, a tendon or an equality moves a part."""
+    """Bodies on the world of which an actuator, a tendon or an equality of joints moves a part."""
     mj = require("mujoco")
-    pulled, wrap = (mj.mjtTrn.mjTRN_JOINT, mj.mjtTrn.mjTRN_JOINTINPARENT), mj.mjtWrap
-    joints = [
-        j
-        for kind, j in zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True)
-        if kind in pulled
-    ]
-    wound = list(zip(model.wrap_type, model.wrap_objid, strict=True))
-    joints += [j for kind, j in wound if kind == wrap.mjWRAP_JOINT]
-    bodies = [model.site_bodyid[site] for kind, site in wound if kind == wrap.mjWRAP_SITE]
+    data = mj.MjData(model)
+    mj.mj_forward(model, data)
+    dofs = {*data.moment_colind.tolist(), *model.ten_J_colind.tolist()}
     for kind, *ends in zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True):
-        joints += [j for j in ends if kind == mj.mjtEq.mjEQ_JOINT and j >= 0]
-    bodies += [model.jnt_bodyid[j] for j in joints]
-    return {int(model.body_rootid[body]) for body in bodies}
+        dofs |= {int(model.jnt_dofadr[j]) for j in ends if kind == mj.mjtEq.mjEQ_JOINT and j >= 0}
+    return {int(model.body_rootid[model.dof_bodyid[dof]]) for dof in dofs}

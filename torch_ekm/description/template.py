@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from .._files import write_whole
 from ..exceptions import DescriptionError, UnknownNameError
 from ._toml import TODO
 from .branch import hand_below
-from .held import unheld_joints
+from .mimic import unheld_joints
 from .mjcf_hand import MjcfHand, read_mjcf
 from .registry import HAND_FILES
 from .transmission_file import document, toml_key
@@ -33,8 +32,7 @@ _HEAD = """\
 # A joint that closes its finger with negative angles has a negative moment arm.
 # All keys: docs/reference/file_formats.md;
 # springs and moment arms from recorded motions: docs/how_to/drive_a_real_hand.md
-"""
-_HAND = """
+
 [hand]
 name = {name}
 base_link = {base}  # the hand frame: poses, contacts and Jacobians are expressed in it
@@ -89,15 +87,17 @@ def write_template(urdf: str | Path, base_link: str | None = None) -> Path:
     mjcf = read_mjcf(path, base_link) if path.suffix != ".urdf" else None
     model = read_urdf(path) if mjcf is None else mjcf.urdf
     model = hand_below(model, base_link or model.root)
+    notes = list(model.notes)
     if base_link is None and (count := len(model.moving_joints)) > _MANY:
-        note = f"all {count} joints are the hand's; of a robot, --base LINK keeps those that one link carries"
-        model = replace(model, notes=(note, *model.notes))
+        notes.append(f"all {count} joints are the hand's; of a robot, --base LINK keeps those beyond a link")
     written = path.with_suffix(".transmission.toml")
     if not model.moving_joints:
-        raise DescriptionError(path, "; ".join(["there is no revolute or continuous joint", *model.notes]))
+        raise DescriptionError(path, "; ".join(["there is no revolute or continuous joint", *notes]))
     if written.exists():
         raise DescriptionError(written, "is there already and is not overwritten; move it away first")
-    write_whole(written, template(model, base_link) if mjcf is None else mjcf_template(mjcf))
+    text = template(model, base_link) if mjcf is None else mjcf_template(mjcf)
+    said = "".join(f"{ASSUMED}{_comment(note)}\n" for note in notes)
+    write_whole(written, text.replace("\n[hand]\n", f"{said}\n[hand]\n", 1))
     return written
 
 
@@ -105,7 +105,7 @@ def mjcf_template(mjcf: MjcfHand) -> str:
     """The text of the transmission file of an MJCF, with TODO for pads, and for what it needs and has not."""
     head = _MJCF_HEAD.format(mjcf=_comment(mjcf.urdf.path.name)).rstrip("\n")
     tables = mjcf.tables | {"joints": _with_springs(mjcf)}
-    lines = [head, *_notes(mjcf.urdf), "", document(tables).rstrip("\n")]
+    lines = [head, "", document(tables).rstrip("\n")]
     if not mjcf.tables["actuators"]:
         lines += _actuators(mjcf.urdf)
     return "\n".join([*lines, *_pads(mjcf.urdf)]) + "\n"
@@ -122,16 +122,12 @@ def _with_springs(mjcf: MjcfHand) -> dict[str, dict[str, Any]]:
     return {name: table | ({"spring": TODO} if name in loose else {}) for name, table in joints.items()}
 
 
-def _notes(model: UrdfModel) -> list[str]:
-    return [f"{ASSUMED}{_comment(note)}" for note in model.notes]
-
-
 def template(model: UrdfModel, base_link: str | None = None) -> str:
     """The text of the transmission file, with TODO where the URDF has no figure."""
     base = base_link or _base(model)
     normal = _planar_normal(model, base)
-    head = _HEAD.format(urdf=_comment(model.path.name)).rstrip("\n")
-    lines = [head, *_notes(model), _HAND.format(name=_text(model.name), base=_text(base)).rstrip("\n")]
+    head = _HEAD.format(urdf=_comment(model.path.name), name=_text(model.name), base=_text(base))
+    lines = [head.rstrip("\n")]
     if normal is not None:
         lines.append(f"planar_normal = {_vector(normal)}  # all joints turn in one plane: a planar hand")
     lines += [_JOINTS.rstrip("\n"), *_joints(model), *_couplings(model)]

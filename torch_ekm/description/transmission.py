@@ -16,8 +16,7 @@ from ..exceptions import DescriptionError, JointMismatchError
 from ._toml import TODO, TomlTable, read_toml
 from .branch import hand_below
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
-from .held import unheld_joints
-from .mimic import overruled
+from .mimic import overruled, unheld_joints
 from .mjcf_hand import MjcfHand
 from .urdf import UrdfModel
 
