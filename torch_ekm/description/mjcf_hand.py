@@ -190,12 +190,13 @@ class _Conversion:
         actuators = [actuator for actuator in actuators if actuator is not None]
         drives = [self._row(actuator["moment_arms"]) for actuator in actuators]
         couplings = list(self._equalities(actuated))
-        for coupling in self._tendon_couplings(actuated):
-            rows = [*drives, *(row for _, row, _ in couplings), coupling[1]]
+        for note, label, row, value in self._tendon_couplings(actuated):
+            rows = [*drives, *(row for _, row, _ in couplings), row]
             if np.linalg.matrix_rank(rows) == len(rows):
-                couplings.append(coupling)
+                couplings.append((label, row, value))
             else:
-                self._note("tendons that tie joints with motors of their own are left out", coupling[0])
+                note = "tendons that tie joints with motors of their own are left out"
+            self._note(note, label)
         for link in self.urdf.links:
             if link.name in self.meshes:
                 self._note("links whose meshes are not read, and touch nothing", link.name)
@@ -359,8 +360,8 @@ class _Conversion:
         """Where MuJoCo counts a joint from, and holds one that is not of the hand."""
         return float(self.model.qpos0[self.model.jnt_qposadr[joint]])
 
-    def _tendon_couplings(self, used: set[int]) -> Iterator[tuple[str, Array, float]]:
-        """Tendons that nobody pulls: stiff ones and those that can hardly move tie their joints."""
+    def _tendon_couplings(self, used: set[int]) -> Iterator[tuple[str, str, Array, float]]:
+        """Tendons that nobody pulls: stiff ones, and those that can hardly move, tie joints; with notes."""
         model = self.model
         for t in range(model.ntendon):
             if t in used:
@@ -373,15 +374,13 @@ class _Conversion:
             low, high = model.tendon_range[t].tolist()
             spring = model.tendon_lengthspring[t]
             if model.tendon_stiffness[t] > 0 and spring[0] == spring[1]:
-                self.notes.append(f"the spring of tendon '{name}' ties its joints rigidly")
-                yield name, row, float(spring[0]) - offset
+                yield "tendons with springs tie their joints rigidly", name, row, float(spring[0]) - offset
             elif (
                 model.tendon_limited[t]
                 and high - low < _NARROW * (longest - shortest)
                 and (row != 0).sum() > 1
             ):
-                self._note("tendons that can hardly move tie their joints", f"{name} ({high - low:.3g})")
-                yield name, row, (low + high) / 2 - offset
+                yield "tendons that can hardly move tie their joints", name, row, (low + high) / 2 - offset
             elif model.tendon_limited[t] or model.tendon_stiffness[t] > 0:
                 self._note("tendons that only limit or spring are left out", name)
 
