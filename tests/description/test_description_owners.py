@@ -255,7 +255,7 @@ def test_carrying_slides_are_held_and_things_left_out(tmp_path: Path) -> None:
         "these move and nothing drives them: they are left out: thing",
         "shapes other than box, sphere, capsule and cylinder touch nothing, those of: palm",
         "actuators that drive no joint of the hand are left out: rail",
-        "motors of tendons count in the angle of a pulley, of their largest arm: pull (10 mm)",
+        "these count in the length of their tendon, not in rad: pull",
     )
 
 
@@ -267,17 +267,6 @@ def test_the_mass_that_a_file_sets_is_the_hands(tmp_path: Path, monkeypatch: pyt
     for link, share in zip(read(tmp_path, CARRIED).urdf.links, shares, strict=True):
         assert link.mass == pytest.approx(2 * share / (sum(shares) + 1000 * 4 / 3 * np.pi * 0.02**3))
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
-
-
-def test_a_motor_in_metres_of_tendon_counts_in_an_angle(tmp_path: Path) -> None:
-    """Of a pulley of the largest arm: the same torques and the same stiffness at the joints."""
-    hand = read(tmp_path, CARRIED)
-    row, motor = hand.actuation_jacobian[2], hand.actuators[2]
-    np.testing.assert_allclose(row, [0, 0, 1.0, 0.5])
-    np.testing.assert_allclose([motor.lower, motor.upper, motor.offset], [5.0, 7.0, 5.0])
-    K = motor.stiffness * np.outer(row, row)
-    arms = np.array([0, 0, 0.01, 0.005])
-    np.testing.assert_allclose(K, 4000 * np.outer(arms, arms))
 
 
 def test_a_base_link_cuts_a_hand_out_of_an_mjcf(tmp_path: Path) -> None:

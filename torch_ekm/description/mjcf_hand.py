@@ -28,7 +28,6 @@ _WORLD = "world"
 _NARROW = (
     0.2  # a limited tendon is a coupling if it may move by less than this share of what its joints allow
 )
-_METRES = 0.1  # a tendon of smaller moment arms is counted in metres
 _LIGHT = 2e-6  # [kg]: MuJoCo's bound, not a body's
 _SAME_ARM = 0.1  # relative change of a moment arm up to which it counts as constant
 _DRAWN = 200  # postures at which the arms of a spatial tendon are looked at
@@ -237,24 +236,20 @@ class _Conversion:
         table: dict[str, Any] = {"name": name}
         low, high = model.actuator_forcerange[k] if model.actuator_forcelimited[k] else (-1.0, 1.0)
         pulls_back = high <= 0  # MuJoCo's tendons pull where they shorten; here where `a` grows
-        unit = float(np.abs(row).max())
-        if int(model.actuator_trntype[k]) == kinds.mjTRN_TENDON and unit < _METRES:
-            pulley = f"{name} ({1e3 * unit:.4g} mm)"
-            self._note("motors of tendons count in the angle of a pulley, of their largest arm", pulley)
-        else:
-            unit = 1.0
         if bias < 0 < gain:
             if model.actuator_ctrllimited[k]:
                 length = gain / -bias * model.actuator_ctrlrange[k]
-            table["stiffness"] = -bias * unit**2
+            table["stiffness"] = -bias
         else:
             self._note("actuators without position control are taken as rigid, over their whole stroke", name)
-        per = -1.0 / unit if pulls_back else 1.0 / unit
+        sign = -1.0 if pulls_back else 1.0
         finite = np.isfinite(length).all()
-        table["range"] = sorted((per * length).tolist()) if finite else [TODO, TODO]
-        table["offset"] = per * offset
-        table["moment_arms"] = self._named(per * row)
+        table["range"] = sorted((sign * length).tolist()) if finite else [TODO, TODO]
+        table["offset"] = sign * offset
+        table["moment_arms"] = self._named(sign * row)
         table["tendon"] = bool(pulls_back or low >= 0)
+        if int(model.actuator_trntype[k]) == kinds.mjTRN_TENDON and np.abs(row).max() < 0.1:
+            self._note("these count in the length of their tendon, not in rad", name)
         return table
 
     def _driven(self, k: int, actuated: set[int]) -> tuple[Array, float]:
