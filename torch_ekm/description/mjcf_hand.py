@@ -19,6 +19,7 @@ from ..typing import Array
 from ._toml import TODO
 from ._xml import listed
 from .branch import hand_below
+from .mimic import unheld_joints
 from .mjcf import compile_mjcf
 from .mjcf_things import things
 from .shape import Shape
@@ -42,6 +43,8 @@ class MjcfHand:
 
     urdf: UrdfModel
     tables: dict[str, Any]
+    loose: list[str]
+    """Joints that nothing holds."""
 
 
 def read_mjcf(path: str | Path, base_link: str | None = None, named: Iterable[str] = ()) -> MjcfHand:
@@ -91,7 +94,7 @@ class _Conversion:
         self.urdf = urdf
         tables = self._tables(name)
         notes = [*self.notes, *(listed(note, names) for note, names in self.of.items())]
-        self.hand = MjcfHand(replace(urdf, notes=tuple(notes)), tables)
+        self.hand = MjcfHand(replace(urdf, notes=tuple(notes)), tables, self.loose)
 
     def _note(self, note: str, name: str) -> None:
         self.of.setdefault(note, []).append(name)
@@ -201,6 +204,10 @@ class _Conversion:
                 self._note("links whose meshes are not read, and touch nothing", link.name)
                 if link.mass < _LIGHT:
                     self._note("without their meshes these have no mass, and 1 mg here", link.name)
+        rows, k = [*drives, *(row for _, row, _ in couplings)], self.model.jnt_stiffness[self.hinges]
+        self.loose = unheld_joints(
+            [self.names[j] for j in self.hinges], np.reshape(rows, (-1, len(k))), np.diag(k)
+        )
         rests = self._rests(couplings)
         springs = {
             self.names[j]: {

@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,6 @@ from .._files import write_whole
 from ..exceptions import DescriptionError, UnknownNameError
 from ._toml import TODO
 from .branch import hand_below
-from .mimic import unheld_joints
 from .mjcf_hand import MjcfHand, read_mjcf
 from .registry import HAND_FILES
 from .transmission_file import document, toml_key
@@ -104,22 +102,12 @@ def write_template(urdf: str | Path, base_link: str | None = None) -> Path:
 def mjcf_template(mjcf: MjcfHand) -> str:
     """The text of the transmission file of an MJCF, with TODO for pads, and for what it needs and has not."""
     head = _MJCF_HEAD.format(mjcf=_comment(mjcf.urdf.path.name)).rstrip("\n")
-    tables = mjcf.tables | {"joints": _with_springs(mjcf)}
+    joints = mjcf.tables["joints"]
+    tables = mjcf.tables | {"joints": joints | {name: joints[name] | {"spring": TODO} for name in mjcf.loose}}
     lines = [head, "", document(tables).rstrip("\n")]
     if not mjcf.tables["actuators"]:
         lines += _actuators(mjcf.urdf)
     return "\n".join([*lines, *_pads(mjcf.urdf)]) + "\n"
-
-
-def _with_springs(mjcf: MjcfHand) -> dict[str, dict[str, Any]]:
-    """The joints of an MJCF, with TODO for springs of those that nothing else holds."""
-    joints = mjcf.tables["joints"]
-    rows = [table["moment_arms"] for table in mjcf.tables["actuators"]]
-    rows += [table["joints"] for table in mjcf.tables["couplings"]]
-    matrix = np.array([[row.get(name, 0.0) for name in joints] for row in rows]).reshape(-1, len(joints))
-    springs = np.diag([table["spring"] for table in joints.values()])
-    loose = unheld_joints(tuple(joints), matrix, springs)
-    return {name: table | ({"spring": TODO} if name in loose else {}) for name, table in joints.items()}
 
 
 def template(model: UrdfModel, base_link: str | None = None) -> str:
