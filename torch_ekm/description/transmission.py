@@ -13,14 +13,13 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..exceptions import DescriptionError, JointMismatchError
-from ._toml import TomlTable, read_toml
+from ._toml import TODO, TomlTable, read_toml
+from .branch import hand_below
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
-from .mimic import check_mimics
+from .mimic import overruled, unheld_joints
 from .mjcf_hand import MjcfHand
 from .urdf import UrdfModel
 
-#: Stands for a figure that is still to be filled in.
-TODO = "TODO"
 TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
 HAND = ("name", "base_link", "planar_normal", "gravity", "pinch_force")
 JOINT = ("spring", "rest", "rest_deg", "friction")
@@ -55,21 +54,20 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     top = TomlTable(path, "top level", data, TABLES)
     if not isinstance(data.get("notes", {}), dict):
         raise top.error("'notes' must be a table of text, which no program reads")
+    hand = TomlTable(path, "[hand]", top.data.get("hand"), HAND)
+    base, given = hand.text("base_link", urdf.root), top.data.get("joints", {})
+    robot, urdf = urdf, hand_below(urdf, base, given if isinstance(given, dict) else (), path)
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
-        raise DescriptionError(urdf.path, "there is no revolute or continuous joint")
-    hand = TomlTable(path, "[hand]", top.data.get("hand"), HAND)
-    base = hand.text("base_link", urdf.root)
-    _check_base(path, base, urdf)
-
-    springs = _joint_table(path, top.data.get("joints", {}), names)
+        raise hand.error(f"base_link '{base}' carries no revolute or continuous joint")
+    springs = _joint_table(path, given, names, {joint.name for joint in robot.moving_joints})
     actuators = _each(top, "actuators", lambda place, data: _actuator(path, place, data), minimum=1)
     couplings = _each(top, "couplings", lambda place, data: TomlTable(path, place, data, COUPLING))
     J_a = _rows(path, names, [(f"actuator '{a.name}'", arms) for a, arms in actuators])
     C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
     K_s = springs[:, 0]
-    check_mimics(path, urdf.path, urdf.mimics, names, C, springs[:, 1])
+    notes = overruled(urdf.mimics, names, C, springs[:, 1])
     _check_mechanism(path, names, J_a, C, K_s)
     pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
     hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
@@ -98,7 +96,7 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
         gravity=(gravity[0], gravity[1], gravity[2]),
         pinch_force=hand.number("pinch_force", HandDescription.pinch_force, positive=True),
-        notes=() if mjcf is None else tuple(mjcf.notes),
+        notes=(*urdf.notes, *notes),
     )
 
 
@@ -188,11 +186,14 @@ def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSens
     return HallSensor(joint, channel, table.number("open", 255.0), table.number("closed", 0.0))
 
 
-def _joint_table(path: Path, data: Any, names: tuple[str, ...]) -> np.ndarray:
-    """Rows (spring stiffness [N m/rad], rest [rad], Coulomb friction [N m]) in the order of ``names``."""
+def _joint_table(path: Path, data: Any, names: tuple[str, ...], robot: set[str]) -> np.ndarray:
+    """Rows (spring stiffness [N m/rad], rest [rad], Coulomb friction [N m]) in the order of ``names``.
+
+    Other joints of the ``robot`` may be there.
+    """
     given = TomlTable(path, "[joints]", data, data if isinstance(data, dict) else ()).data
     missing = [name for name in names if name not in given]
-    unexpected = [name for name in given if name not in names]
+    unexpected = [name for name in given if name not in names and name not in robot]
     if missing or unexpected:
         raise JointMismatchError(path, missing, unexpected, names)
     rows = []
@@ -219,34 +220,18 @@ def _check_mechanism(
 ) -> None:
     """``[J_a; C]`` must have full row rank, and K_s must hold what it leaves free."""
     B = np.vstack([J_a, C])
-    _, singular, V = np.linalg.svd(B)
+    singular = np.linalg.svd(B, compute_uv=False)
     rank = int((singular > 1e-9 * singular[0]).sum())
     if rank < len(B):
         parts = f"{len(J_a)} actuators and {len(C)} couplings give only {rank} independent rows"
         raise DescriptionError(path, f"moment arms and couplings must be linearly independent: {parts}")
-    N = V[rank:].T
-    if N.size:
-        stiffness, modes = np.linalg.eigh(N.T @ (K_s[:, None] * N))
-        if stiffness[0] <= 1e-9 * max(1.0, stiffness[-1]):
-            loose = np.abs(N @ modes[:, 0])
-            pairs = zip(names, loose, strict=True)
-            joints = ", ".join(name for name, part in pairs if part > 0.3 * loose.max())
-            problem = f"no spring, actuator or coupling holds the joints {joints}"
-            problem += ": give them a positive 'spring' in [joints]"
-            if path.suffix == ".xml":
-                problem += f" of a transmission file; 'torch-ekm hands --new {path}' writes one"
-            raise DescriptionError(path, problem)
-
-
-def _check_base(path: Path, base: str, urdf: UrdfModel) -> None:
-    """The hand frame must not move: only fixed joints between the root and it."""
-    links = [link.name for link in urdf.links]
-    if base not in links:
-        raise DescriptionError(path, f"[hand]: unknown base_link '{base}'; links are: {', '.join(links)}")
-    moving = [joint.name for joint in urdf.joints_to(base) if joint.kind != "fixed"]
-    if moving:
-        problem = f"base_link '{base}' moves with joint '{moving[-1]}'; choose a fixed link"
-        raise DescriptionError(path, f"[hand]: {problem}")
+    loose = unheld_joints(names, B, np.diag(K_s))
+    if loose:
+        problem = f"no spring, actuator or coupling holds the joints {', '.join(loose)}"
+        problem += ": give them a positive 'spring' in [joints]"
+        if path.suffix != ".toml":
+            problem += f" of a transmission file; 'torch-ekm hands --new {path}' writes one"
+        raise DescriptionError(path, problem)
 
 
 def _check_unique(path: Path, kind: str, names: Iterable[str]) -> None:

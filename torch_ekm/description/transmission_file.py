@@ -35,7 +35,7 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
     path = Path(path)
     if not path.name.endswith(_ENDING):
         raise DescriptionError(path, f"the name must end in '{_ENDING}'")
-    if hand.transmission_path.is_file() or hand.urdf_path.suffix != ".xml":
+    if hand.transmission_path.is_file() or hand.urdf_path.suffix == ".urdf":
         data = read_toml(hand.transmission_path, "transmission file")
     else:
         data = read_mjcf(hand.urdf_path).tables

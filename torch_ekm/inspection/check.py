@@ -58,7 +58,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     except (EKMError, OSError) as error:
         return [Check("hand's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]
-    rows += [Check("MJCF", "warning", note) for note in description.notes]
+    rows += [Check("assumed", "warning", note) for note in description.notes]
     pads = list(_pads(description))
     rows += [*pads, *_ranges(description), *_tensions(description)]
     try:

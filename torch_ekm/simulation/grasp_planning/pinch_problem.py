@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ...contact import signed_distance
 from ...description import HandDescription, ObjectDescription
@@ -23,6 +24,7 @@ from .graspable import object_axes, obstacles
 _THUMB_BENT = (0.65, 0.3, 0.3, 0.5)
 _FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
 _ROOM = 0.02  # [rad] between a motor and the ends of its range
+_CLEAR = 0.002  # [m] that other parts of the hand keep from the object
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ class PinchProblem:
         self._palmar = np.array([pad.direction for pad in self.pads])
         self._radius = np.array([pad.radius for pad in self.pads])
         links, self._ball, self._ball_radius = obstacles(hand, self.pads)
-        self._ball_link = [self.kinematics.link_index(name) for name in links]
+        self._ball_link = np.array([self.kinematics.link_index(name) for name in links], dtype=np.int64)
         self._prepare_mechanism()
         self.axes = object_axes(obj)
         """Of the object, as columns: long axis, grasp axis, their product."""
@@ -186,11 +188,13 @@ class PinchProblem:
                 fraction[joint] = bent[min(place, 3)]
         return low + fraction[self.moving] * (high - low)
 
-    def geometry(self, x: Array) -> PinchGeometry:
+    def geometry(self, x: Array, near: NDArray[np.intp] | None = None) -> PinchGeometry:
         """Forward kinematics and distances of a batch of candidates ``(b, n_x)``.
 
-        Candidates that differ from the last one by their forces alone share its geometry.
+        Candidates that differ from the last one by their forces alone share its geometry. ``near``: numbers
+        of the other parts whose clearance is asked; that of the rest is infinite.
         """
+        near = np.arange(len(self._ball)) if near is None else near
         placed = len(self.moving) + 6  # unknowns before the forces
         own = np.append((x[:-1, :placed] != x[-1, :placed]).any(axis=1), True)
         rows = np.flatnonzero(own)
@@ -204,9 +208,11 @@ class PinchProblem:
         local = np.einsum("bji,bcj->bci", R, centre - o[:, None])
         distance, normal = signed_distance(self.obj.shapes, local)
         n = np.einsum("bij,bcj->bci", R, normal)
-        every = transforms[:, self._ball_link, :3]
-        ball = every[..., 3] + np.einsum("bcij,cj->bci", every[..., :3], self._ball)
-        clearance, _ = signed_distance(self.obj.shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
+        every = transforms[:, self._ball_link[near], :3]
+        ball = every[..., 3] + np.einsum("bcij,cj->bci", every[..., :3], self._ball[near])
+        apart, _ = signed_distance(self.obj.shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
+        clearance = np.full((len(rows), len(self._ball)), np.inf)
+        clearance[:, near] = apart - self._ball_radius[near]
         point = centre - self._radius[:, None] * n
         f = x[:, placed:].reshape(len(x), -1, 3)
         axes, origins = (part.numpy() for part in self.kinematics.joint_axes(poses))
@@ -223,7 +229,7 @@ class PinchProblem:
             facing=(normal @ self.axes[:, 1])[place],
             pad_axis=np.einsum("bcij,cj->bci", turn, self._axis)[place],
             pad_direction=np.einsum("bcij,cj->bci", turn, self._palmar)[place],
-            clearance=(clearance - self._ball_radius)[place],
+            clearance=clearance[place],
             torque=np.einsum("bcqi,bci,cq->bq", lever[place], f, self._upstream),
         )
 
@@ -241,13 +247,16 @@ class PinchProblem:
             [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1], axis=1
         )
 
-    def residuals(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
+    def residuals(
+        self, x: Array, request: PinchRequest, ranges: bool, near: NDArray[np.intp] | None = None
+    ) -> Array:
         """Equations and wishes ``(b, n_r)``, to be squared and summed.
 
         Args:
             ranges: wish that the motors keep to theirs.
+            near: as of :meth:`geometry`.
         """
-        g = self.geometry(x)
+        g = self.geometry(x, near)
         f_n = -np.einsum("bci,bci->bc", g.force, g.normal)
         f_t = np.linalg.norm(g.force + f_n[..., None] * g.normal, axis=-1)
         cone = np.maximum(0.0, f_t - 0.4 * self.obj.friction * f_n) / 0.05
@@ -265,7 +274,7 @@ class PinchProblem:
         tilt = (long_axis - wish) / 0.1
         facing = np.concatenate([-g.facing[:, :1], g.facing[:, 1:]], axis=1)
         opposed = np.maximum(0.0, 0.98 - facing) / 0.05
-        clear = np.maximum(0.0, 0.002 - g.clearance) / 1e-3
+        clear = np.maximum(0.0, _CLEAR - g.clearance) / 1e-3
         posture = (x[:, : len(self.moving)] - self.preferred) / 0.3
         taut = np.maximum(0.0, 0.02 - self.tension(g)[:, self._pulling]) / 0.01
         hard = 3 * self.equations(request, g)
@@ -308,10 +317,14 @@ class PinchProblem:
         return wish / np.linalg.norm(wish)
 
     def jacobian(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
-        """Of :meth:`residuals`, central differences, all columns in one batch."""
+        """Of :meth:`residuals`, central differences, all columns in one batch.
+
+        Parts that are clear of the object stay so in a step.
+        """
         step = 1e-6
         shift = step * np.eye(len(x))
-        values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges)
+        near = np.flatnonzero(self.geometry(x[None]).clearance[0] < 2 * _CLEAR)
+        values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges, near)
         return ((values[: len(x)] - values[len(x) :]) / (2 * step)).T
 
 
