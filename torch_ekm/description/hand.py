@@ -10,6 +10,7 @@ import numpy as np
 
 from ..exceptions import DescriptionError
 from ..typing import Array
+from .lengths import Lengths, Loops, TendonSprings
 from .urdf import UrdfModel
 
 
@@ -17,7 +18,7 @@ from .urdf import UrdfModel
 class Actuator:
     """One motor, as its position controller shows it.
 
-    ``a = offset + J_a[row] q``, and ``lower <= a <= upper``, all [rad].
+    ``a = offset + l(q)``, with constant moment arms ``J_a[row] q``, and ``lower <= a <= upper``, all [rad].
     """
 
     name: str
@@ -87,7 +88,7 @@ class HandDescription:
     joint_upper: Array
     actuators: tuple[Actuator, ...]
     actuation_jacobian: Array
-    """J_a = da/dq, ``(n_a, n_q)``, constant moment arms."""
+    """J_a = da/dq, ``(n_a, n_q)``: constant moment arms, and typical ones of arms that are functions."""
     coupling: Array
     """C with ``C dq = 0``, ``(n_k, n_q)``: rigid couplings and locked joints; ``C q = C q0`` at all times."""
     spring_stiffness: Array
@@ -108,6 +109,12 @@ class HandDescription:
 
     notes: tuple[str, ...] = ()
     """What an MJCF says that is left out or approximated here."""
+    arm_functions: Lengths | None = None
+    """How moment arms change with the posture, as factors of ``actuation_jacobian``; None: they do not."""
+    tendon_springs: TendonSprings | None = None
+    """Springs over tendons."""
+    loops: Loops | None = None
+    """What closes chains, and joints that follow others along a curve."""
 
     def __post_init__(self) -> None:
         if self.planar_normal is not None:
@@ -128,6 +135,11 @@ class HandDescription:
                 problem = f"the axis of joint '{joint.name}' is {degrees:.3g} deg off planar_normal"
                 problem += "; a planar hand turns about it alone"
                 raise DescriptionError(self.transmission_path, problem)
+
+    @property
+    def lengths(self) -> Lengths:
+        """``a = offset + l(q)``, with the arms of ``actuation_jacobian``."""
+        return self.arm_functions or Lengths(self.actuation_jacobian)
 
     @property
     def urdf_path(self) -> Path:

@@ -1,7 +1,8 @@
 """The hand that an MJCF describes: its tree as a URDF would have it, and its transmission.
 
-Fixed tendons give moment arms, tendons and joints under an equality couplings, joint springs springs,
-position actuators ranges and stiffnesses. What has no counterpart is refused, or approximated with a note.
+Tendons give moment arms or are measured by MuJoCo, tendons and joints under an equality couplings, pinned
+points loops, springs of joints and tendons springs, position actuators ranges and stiffnesses. What has no
+counterpart is refused, or approximated with a note.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from .._extras import require
 from ..exceptions import DescriptionError
 from ..typing import Array
 from .mjcf import compile_mjcf
+from .mjcf_tendons import RoutedTendons
 from .shape import Shape
 from .urdf import UrdfJoint, UrdfLink, UrdfModel
 
@@ -24,8 +26,8 @@ _WORLD = "world"
 _NARROW = (
     0.2  # a limited tendon is a coupling if it may move by less than this share of what its joints allow
 )
-_SAME_ARM = 0.1  # relative change of a moment arm up to which it counts as constant
-_DRAWN = 200  # postures at which the arms of a spatial tendon are looked at
+_DRAWN = 200  # postures at which the length of a spatial tendon is looked at
+_OFF = 1e-9  # [rad] or [m] by which springs at rest may miss an equality
 
 
 @dataclass
@@ -38,6 +40,10 @@ class MjcfHand:
     urdf: UrdfModel
     tables: dict[str, Any]
     notes: list[str] = field(default_factory=list)
+    model: Any = None
+    """MuJoCo's, which measures tendons on their ways."""
+    hinges: tuple[int, ...] = ()
+    """Its joints in the order of q."""
 
 
 def read_mjcf(path: str | Path) -> MjcfHand:
@@ -45,8 +51,8 @@ def read_mjcf(path: str | Path) -> MjcfHand:
 
     Raises:
         DescriptionError: as :func:`~torch_ekm.description.mjcf.compile_mjcf`; a joint that slides or is a
-            ball, a loop closed by ``connect`` or ``weld``, an equality that is not linear, an actuator
-            without a joint or a tendon.
+            ball, a loop closed by ``weld``, an equality of tendons that is not linear, an actuator without a
+            joint or a tendon.
         MissingExtraError: mujoco is not installed.
     """
     path = Path(path)
@@ -69,7 +75,7 @@ class _Conversion:
             raise DescriptionError(path, "there is no hinge joint")
         self.place = {int(model.jnt_dofadr[j]): k for k, j in enumerate(self.hinges)}
         self.lower, self.upper = np.array([self._limits(j) for j in self.hinges]).T
-        self.hand = MjcfHand(self.urdf, self._tables(name), self.notes)
+        self.hand = MjcfHand(self.urdf, self._tables(name), self.notes, model, tuple(self.hinges))
 
     # -- links and joints ---------------------------------------------------------------------------
 
@@ -79,6 +85,7 @@ class _Conversion:
         left_out, links, joints = self._objects(names), [self._link(_WORLD, 0, np.eye(4))], []
         frame = {0: (_WORLD, np.eye(4))}
         """Of each body: its link, and its frame in the link's."""
+        self._frame = frame
         for b, name in names.items():
             if b in left_out:
                 continue
@@ -189,11 +196,12 @@ class _Conversion:
         actuators = [self._actuator(k, actuated) for k in range(self.model.nu)]
         if not actuators:
             raise DescriptionError(self.path, "there is no actuator")
+        self._loops: list[dict[str, Any]] = []
         couplings = [*self._equalities(actuated), *self._tendon_couplings(actuated)]
         meshes = sorted(self.meshes & {link.name for link in self.urdf.links})
         if meshes:
             self.notes.append(f"meshes are not read: those of {', '.join(meshes)} touch nothing")
-        rests = self._rests(couplings)
+        rests, couplings = self._rests(couplings)
         springs = {
             self.names[j]: {
                 "spring": float(self.model.jnt_stiffness[j]),
@@ -204,21 +212,31 @@ class _Conversion:
         }
         tables = [{"name": label, "joints": self._named(row)} for label, row, _ in couplings]
         hand = {"name": name, "base_link": _WORLD, "gravity": self.model.opt.gravity.tolist()}
-        return {"hand": hand, "joints": springs, "actuators": actuators, "couplings": tables}
+        found = {"hand": hand, "joints": springs, "actuators": actuators, "couplings": tables}
+        return found | {"tendon_springs": [*self._springs()], "loops": self._loops}
 
-    def _rests(self, couplings: list[tuple[str, Array, float]]) -> Array:
-        """Where springs are slack; joints that are coupled, at the nearest angles that obey the couplings."""
+    def _rests(
+        self, couplings: list[tuple[str, Array, float]]
+    ) -> tuple[Array, list[tuple[str, Array, float]]]:
+        """Where springs are slack, joints without a spring at angles that obey the couplings; and these. One
+        that springs at rest do not obey is a loop with a value of its own."""
         rests = np.array([self.model.qpos_spring[self.model.jnt_qposadr[j]] for j in self.hinges])
         if not couplings:
-            return rests
+            return rests, couplings
         C, length = np.array([row for _, row, _ in couplings]), np.array([value for *_, value in couplings])
-        return rests + np.linalg.pinv(C) @ (length - C @ rests)
+        loose = np.array([self.model.jnt_stiffness[j] == 0 for j in self.hinges])
+        rests[loose] += np.linalg.pinv(C[:, loose]) @ (length - C @ rests)
+        off = np.abs(length - C @ rests) > _OFF
+        for apart, (name, row, value) in zip(off, couplings, strict=True):
+            if apart:
+                self._loops.append({"name": name, "moment_arms": self._named(row), "value": value})
+        return rests, [one for apart, one in zip(off, couplings, strict=True) if not apart]
 
     def _actuator(self, k: int, actuated: set[int]) -> dict[str, Any]:
         model, kinds = self.model, self._mj.mjtTrn
         name = model.actuator(k).name or f"actuator_{k}"
-        row, offset = self._driven(k, name, actuated)
-        length = self._span(row) + offset
+        row, offset, gear, tendon = self._driven(k, name, actuated)
+        length = self._span(row) + offset if tendon is None else self._spatial_span(tendon, gear)
         gain, bias = float(model.actuator_gainprm[k, 0]), float(model.actuator_biasprm[k, 1])
         table: dict[str, Any] = {"name": name}
         low, high = model.actuator_forcerange[k] if model.actuator_forcelimited[k] else (-1.0, 1.0)
@@ -235,35 +253,47 @@ class _Conversion:
             raise DescriptionError(self.path, f"actuator '{name}' has no range, nor have all its joints")
         sign = -1.0 if pulls_back else 1.0
         table["range"] = sorted((sign * length).tolist())
-        table["offset"] = sign * offset
-        table["moment_arms"] = self._named(sign * row)
+        if tendon is None:
+            table |= {"offset": sign * offset, "moment_arms": self._named(sign * row)}
+        else:
+            table["mjcf_tendons"] = {self._tendon_name(tendon): sign * gear}
         table["tendon"] = bool(pulls_back or low >= 0)
         if int(model.actuator_trntype[k]) == kinds.mjTRN_TENDON and np.abs(row).max() < 0.1:
             self.notes.append(f"'{name}' counts in the length of its tendon, not in rad")
         return table
 
-    def _driven(self, k: int, name: str, actuated: set[int]) -> tuple[Array, float]:
-        """Moment arms ``(n_q,)`` and length at zero angles of an actuator."""
+    def _driven(self, k: int, name: str, actuated: set[int]) -> tuple[Array, float, float, int | None]:
+        """Moment arms ``(n_q,)`` and length at zero angles of an actuator, its gear, and its tendon if that
+        has a way of its own."""
         model, kinds = self.model, self._mj.mjtTrn
         gear, target = float(model.actuator_gear[k, 0]), int(model.actuator_trnid[k, 0])
         kind = int(model.actuator_trntype[k])
         if kind == kinds.mjTRN_JOINT or kind == kinds.mjTRN_JOINTINPARENT:
             if target not in self.hinges:
                 raise DescriptionError(self.path, f"actuator '{name}' drives a joint that is not of the hand")
-            return gear * np.eye(len(self.hinges))[self.hinges.index(target)], 0.0
+            return gear * np.eye(len(self.hinges))[self.hinges.index(target)], 0.0, gear, None
         if kind == kinds.mjTRN_TENDON:
             actuated.add(target)
             row, offset = self._tendon(target)
-            return gear * row, gear * offset
+            return gear * row, gear * offset, gear, None if self._is_fixed(target) else target
         raise DescriptionError(self.path, f"actuator '{name}' drives neither a joint nor a tendon")
 
+    def _tendon_name(self, t: int) -> str:
+        return self.model.tendon(t).name or f"tendon_{t}"
+
+    def _parts(self, t: int) -> range:
+        return range(self.model.tendon_adr[t], self.model.tendon_adr[t] + self.model.tendon_num[t])
+
+    def _is_fixed(self, t: int) -> bool:
+        joint = self._mj.mjtWrap.mjWRAP_JOINT
+        return all(int(self.model.wrap_type[w]) == joint for w in self._parts(t))
+
     def _tendon(self, t: int) -> tuple[Array, float]:
-        """Moment arms ``(n_q,)`` and length at zero angles: exact for fixed tendons."""
+        """Moment arms ``(n_q,)`` and length at zero angles: exact for fixed tendons, else at rest."""
         model = self.model
-        parts = range(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
-        if all(int(model.wrap_type[w]) == self._mj.mjtWrap.mjWRAP_JOINT for w in parts):
+        if self._is_fixed(t):
             row = np.zeros(len(self.hinges))
-            for w in parts:
+            for w in self._parts(t):
                 joint = int(model.wrap_objid[w])
                 if joint not in self.hinges:
                     raise DescriptionError(
@@ -271,54 +301,86 @@ class _Conversion:
                     )
                 row[self.hinges.index(joint)] += model.wrap_prm[w]
             return row, 0.0
-        return self._spatial(t)
-
-    def _spatial(self, t: int) -> tuple[Array, float]:
-        """Moment arms at the springs' rest, and a note that says how far from there they hold."""
-        model, data = self.model, self._mj.MjData(self.model)
-
-        def arms(q: Array) -> tuple[Array, float]:
-            for angle, j in zip(q, self.hinges, strict=True):
-                data.qpos[model.jnt_qposadr[j]] = angle
-            self._mj.mj_forward(model, data)
-            row = np.zeros(len(self.hinges))
-            first = int(model.ten_J_rowadr[t])
-            for i in range(first, first + int(model.ten_J_rownnz[t])):
-                row[self.place[int(model.ten_J_colind[i])]] += data.ten_J[i]
-            return row, float(data.ten_length[t])
-
         rest = np.array([model.qpos_spring[model.jnt_qposadr[j]] for j in self.hinges])
-        row, length = arms(rest)
-        low, high = np.maximum(self.lower, rest - np.pi), np.minimum(self.upper, rest + np.pi)
-        draw, holds = np.random.default_rng(0), np.inf
-        for _ in range(_DRAWN):
-            q = draw.uniform(low, high)
-            if np.abs(arms(q)[0] - row).max() > _SAME_ARM * np.abs(row).max():
-                holds = min(holds, float(np.abs(q - rest)[row != 0].max(initial=0.0)))
-        where = "everywhere" if np.isinf(holds) else f"within {np.degrees(holds):.0f} deg of there"
-        name = model.tendon(t).name
-        self.notes.append(f"tendon '{name}' has the moment arms of the rest posture, right to 10 % {where}")
-        return row, length - float(row @ rest)
+        length, J = RoutedTendons(model, [{t: 1.0}], self.hinges)(rest)
+        return J[0], float(length[0] - J[0] @ rest)
+
+    def _spatial_span(self, t: int, gear: float) -> Array:
+        """Least and largest length of a tendon within the joints' limits ``(2,)``, as far as seen."""
+        low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
+        draw, routed = np.random.default_rng(0), RoutedTendons(self.model, [{t: gear}], self.hinges)
+        lengths = [routed(q)[0][0] for q in (low, high, *draw.uniform(low, high, (_DRAWN, len(low))))]
+        return np.array([min(lengths), max(lengths)])
+
+    def _springs(self) -> Iterator[dict[str, Any]]:
+        """Springs over tendons."""
+        for t in np.flatnonzero(self.model.tendon_stiffness > 0).tolist():
+            table: dict[str, Any] = {"name": self._tendon_name(t)}
+            if self._is_fixed(t):
+                table["moment_arms"] = self._named(self._tendon(t)[0])
+            else:
+                table["mjcf_tendons"] = {self._tendon_name(t): 1.0}
+            ends = self.model.tendon_lengthspring[t].tolist()
+            yield table | {"stiffness": float(self.model.tendon_stiffness[t]), "slack": ends}
 
     def _equalities(self, actuated: set[int]) -> Iterator[tuple[str, Array, float]]:
         """``C q = c``, one row for each equality."""
         model, kinds = self.model, self._mj.mjtEq
         for e in range(model.neq):
             kind, name = int(model.eq_type[e]), model.equality(e).name or f"equality_{e}"
-            if kind != kinds.mjEQ_JOINT and kind != kinds.mjEQ_TENDON:
-                raise DescriptionError(
-                    self.path, f"equality '{name}' closes a loop: only joints and tendons are tied"
-                )
-            if np.any(model.eq_data[e, 2:5]):
-                raise DescriptionError(self.path, f"equality '{name}' is not linear: couplings are")
             first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            if not model.eq_active0[e]:
+                continue
+            if kind == kinds.mjEQ_CONNECT:
+                self._connect(e, name)
+                continue
+            if kind != kinds.mjEQ_JOINT and kind != kinds.mjEQ_TENDON:
+                problem = f"equality '{name}' welds bodies: only joints, tendons and points are tied"
+                raise DescriptionError(self.path, problem)
+            if np.any(model.eq_data[e, 2:5]) and second >= 0:
+                self._curve(e, kind, name)
+                continue
             constant, slope = model.eq_data[e, :2].tolist()
+            tied = {first: 1.0} | ({second: -slope} if second >= 0 else {})
+            if kind == kinds.mjEQ_TENDON and not all(map(self._is_fixed, tied)):
+                actuated |= set(tied)
+                value = constant + sum(weight * model.tendon_length0[t] for t, weight in tied.items())
+                weights = {self._tendon_name(t): weight for t, weight in tied.items()}
+                self._loops.append({"name": name, "mjcf_tendons": weights, "value": float(value)})
+                continue
             row, value = self._tied(kind, first, actuated)
             value += constant
             if second >= 0:
                 other, there = self._tied(kind, second, actuated)
                 row, value = row - slope * other, value - slope * there
             yield name, row, value
+
+    def _connect(self, e: int, name: str) -> None:
+        """Points of two links, where MuJoCo pins them."""
+        model, links, points = self.model, [], []
+        of_sites = int(model.eq_objtype[e]) == self._mj.mjtObj.mjOBJ_SITE
+        for k, which in enumerate((int(model.eq_obj1id[e]), int(model.eq_obj2id[e]))):
+            body = int(model.site_bodyid[which]) if of_sites else which
+            point = model.site_pos[which] if of_sites else model.eq_data[e, 3 * k : 3 * k + 3]
+            if body not in self._frame:
+                raise DescriptionError(self.path, f"equality '{name}' pins what is not of the hand")
+            link, frame = self._frame[body]
+            links.append(link)
+            points.append((frame[:3, :3] @ point + frame[:3, 3]).tolist())
+        self._loops.append({"name": name, "links": links, "points": points})
+
+    def _curve(self, e: int, kind: int, name: str) -> None:
+        """A joint that follows another along a polynomial of up to the fourth power."""
+        model = self.model
+        first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        if kind != self._mj.mjtEq.mjEQ_JOINT or not {first, second} <= set(self.hinges):
+            raise DescriptionError(
+                self.path, f"equality '{name}' is not linear: only those of hinges need not be"
+            )
+        start, other = (float(model.qpos0[model.jnt_qposadr[j]]) for j in (first, second))
+        curve = np.polynomial.Polynomial(model.eq_data[e, :5])(np.polynomial.Polynomial([-other, 1.0]))
+        arms = {self.names[first]: 1.0, self.names[second]: (-curve.deriv().coef).tolist()}
+        self._loops.append({"name": name, "moment_arms": arms, "value": start + float(curve(0.0))})
 
     def _tied(self, kind: int, which: int, actuated: set[int]) -> tuple[Array, float]:
         """The row of a joint or tendon under an equality, and its value where MuJoCo counts from."""
@@ -333,7 +395,7 @@ class _Conversion:
         return row, float(model.tendon_length0[which]) - offset
 
     def _tendon_couplings(self, used: set[int]) -> Iterator[tuple[str, Array, float]]:
-        """Tendons that nobody pulls: stiff ones and those that can hardly move tie their joints."""
+        """Tendons that nobody pulls: those that can hardly move tie their joints."""
         model, left_out = self.model, []
         for t in range(model.ntendon):
             if t in used:
@@ -342,11 +404,7 @@ class _Conversion:
             row, offset = self._tendon(t)
             shortest, longest = self._span(row)
             low, high = model.tendon_range[t].tolist()
-            spring = model.tendon_lengthspring[t]
-            if model.tendon_stiffness[t] > 0 and spring[0] == spring[1]:
-                self.notes.append(f"the spring of tendon '{name}' ties its joints rigidly")
-                yield name, row, float(spring[0]) - offset
-            elif (
+            if (
                 model.tendon_limited[t]
                 and high - low < _NARROW * (longest - shortest)
                 and (row != 0).sum() > 1
@@ -355,11 +413,11 @@ class _Conversion:
                     f"tendon '{name}' ties its joints, without the {high - low:.3g} that it may move"
                 )
                 yield name, row, (low + high) / 2 - offset
-            elif model.tendon_limited[t] or model.tendon_stiffness[t] > 0:
+            elif model.tendon_limited[t]:
                 left_out.append(name)
 
         if left_out:
-            self.notes.append(f"tendons that only limit or spring are left out: {', '.join(left_out)}")
+            self.notes.append(f"tendons that only limit are left out: {', '.join(left_out)}")
 
     def _span(self, row: Array) -> Array:
         """Least and largest ``row q`` within the joints' limits ``(2,)``."""

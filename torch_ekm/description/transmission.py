@@ -1,6 +1,6 @@
 """Read a transmission file: what a URDF cannot describe of a hand.
 
-Actuators and their moment arms (J_a), rigid couplings (C dq = 0), joint springs and friction,
+Actuators and their moment arms (J_a), rigid couplings (C dq = 0), loops, springs over joints and tendons,
 contact pads, Hall sensors. The format is documented in ``docs/reference/file_formats.md``.
 """
 
@@ -15,18 +15,21 @@ import numpy as np
 from ..exceptions import DescriptionError, JointMismatchError
 from ._toml import TomlTable, read_toml
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
+from .length_tables import LOOP, SPRING, LengthReader
 from .mimic import check_mimics
 from .mjcf_hand import MjcfHand
 from .urdf import UrdfModel
 
 #: Stands for a figure that is still to be filled in.
 TODO = "TODO"
-TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
+TABLES = (
+    "hand", "joints", "actuators", "couplings", "tendon_springs", "loops", "pads", "hall_sensors", "notes",
+)  # fmt: skip
 HAND = ("name", "base_link", "planar_normal", "gravity", "pinch_force")
 JOINT = ("spring", "rest", "rest_deg", "friction")
 ACTUATOR = (
-    "name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "tendon", "stiffness",
-    "backlash", "backlash_deg", "posture",
+    "name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "mjcf_tendons", "tendon",
+    "stiffness", "backlash", "backlash_deg", "posture",
 )  # fmt: skip
 COUPLING = ("name", "joints")
 PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
@@ -64,16 +67,26 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     _check_base(path, base, urdf)
 
     springs = _joint_table(path, top.data.get("joints", {}), names)
-    actuators = _each(top, "actuators", lambda place, data: _actuator(path, place, data), minimum=1)
+    reader = LengthReader(urdf, names, springs[:, 1], mjcf)
+    motors = _each(top, "actuators", lambda place, data: TomlTable(path, place, data, ACTUATOR), minimum=1)
+    actuators, lengths = [_actuator(table) for table in motors], reader.lengths(motors)
+    tendon_springs = reader.springs(_each(top, "tendon_springs", _of(path, SPRING)))
+    loops = reader.loops(_each(top, "loops", _of(path, LOOP)))
     couplings = _each(top, "couplings", lambda place, data: TomlTable(path, place, data, COUPLING))
-    J_a = _rows(path, names, [(f"actuator '{a.name}'", arms) for a, arms in actuators])
+    J_a = lengths.typical
     C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
     K_s = springs[:, 0]
     check_mimics(path, urdf.path, urdf.mimics, names, C, springs[:, 1])
-    _check_mechanism(path, names, J_a, C, K_s)
+    K, closed = np.diag(K_s), np.zeros((0, len(names)))
+    if tendon_springs is not None:  # as if all of them were stretched
+        arms = tendon_springs.lengths.typical
+        K = K + arms.T @ (tendon_springs.stiffness[:, None] * arms)
+    if loops is not None:
+        closed = loops.jacobian(springs[:, 1])
+    _check_mechanism(path, names, J_a, C, K, closed)
     pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
     hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
-    _check_unique(path, "actuator", [actuator.name for actuator, _ in actuators])
+    _check_unique(path, "actuator", [actuator.name for actuator in actuators])
     _check_unique(path, "pad", [pad.name for pad in pads])
     _check_unique(path, "Hall channel", [str(sensor.channel) for sensor in hall])
     normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
@@ -87,7 +100,7 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
         joint_names=names,
         joint_lower=np.array([joint.lower for joint in joints]),
         joint_upper=np.array([joint.upper for joint in joints]),
-        actuators=tuple(actuator for actuator, _ in actuators),
+        actuators=tuple(actuators),
         actuation_jacobian=J_a,
         coupling=C,
         spring_stiffness=K_s,
@@ -99,6 +112,9 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
         gravity=(gravity[0], gravity[1], gravity[2]),
         pinch_force=hand.number("pinch_force", HandDescription.pinch_force, positive=True),
         notes=() if mjcf is None else tuple(mjcf.notes),
+        arm_functions=None if lengths.constant else lengths,
+        tendon_springs=tendon_springs,
+        loops=loops,
     )
 
 
@@ -136,15 +152,18 @@ def _each(top: TomlTable, key: str, read: Callable[[str, Any], T], minimum: int 
     return results
 
 
-def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, float]]:
-    table = TomlTable(path, place, data, ACTUATOR)
+def _of(path: Path, valid: tuple[str, ...]) -> Callable[[str, Any], TomlTable]:
+    return lambda place, data: TomlTable(path, place, data, valid)
+
+
+def _actuator(table: TomlTable) -> Actuator:
     lower, upper = table.angles("range", 2)
     if lower >= upper:
         raise table.error(f"range reversed or empty: {lower:g} to {upper:g} rad")
     backlash = table.angle("backlash", 0.0)
     if backlash < 0:
         raise table.error(f"'backlash' must be at least 0, got {backlash:g} rad")
-    actuator = Actuator(
+    return Actuator(
         name=table.text("name"),
         lower=lower,
         upper=upper,
@@ -154,7 +173,6 @@ def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, fl
         backlash=backlash,
         posture=table.flag("posture", False),
     )
-    return actuator, table.weights("moment_arms")
 
 
 def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
@@ -215,18 +233,19 @@ def _rows(path: Path, names: tuple[str, ...], entries: list[tuple[str, dict[str,
 
 
 def _check_mechanism(
-    path: Path, names: tuple[str, ...], J_a: np.ndarray, C: np.ndarray, K_s: np.ndarray
+    path: Path, names: tuple[str, ...], J_a: np.ndarray, C: np.ndarray, K: np.ndarray, closed: np.ndarray
 ) -> None:
-    """``[J_a; C]`` must have full row rank, and K_s must hold what it leaves free."""
+    """``[J_a; C]`` must have full row rank, and K must hold what it and ``closed`` loops leave free."""
     B = np.vstack([J_a, C])
-    _, singular, V = np.linalg.svd(B)
+    singular = np.linalg.svd(B, compute_uv=False)
     rank = int((singular > 1e-9 * singular[0]).sum())
     if rank < len(B):
         parts = f"{len(J_a)} actuators and {len(C)} couplings give only {rank} independent rows"
         raise DescriptionError(path, f"moment arms and couplings must be linearly independent: {parts}")
-    N = V[rank:].T
+    _, singular, V = np.linalg.svd(np.vstack([B, closed]))
+    N = V[int((singular > 1e-9 * singular[0]).sum()) :].T
     if N.size:
-        stiffness, modes = np.linalg.eigh(N.T @ (K_s[:, None] * N))
+        stiffness, modes = np.linalg.eigh(N.T @ K @ N)
         if stiffness[0] <= 1e-9 * max(1.0, stiffness[-1]):
             loose = np.abs(N @ modes[:, 0])
             pairs = zip(names, loose, strict=True)

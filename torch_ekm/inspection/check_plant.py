@@ -62,7 +62,8 @@ class _Checked:
         self.plant, self.hand, self.object = plant, hand, obj
         self._gate = Gate(plant, hand)
         self.wiring: Wiring | None = getattr(plant, "wiring", None)
-        self.free = ActuationMap(hand).free_motion.numpy()
+        middle = torch.from_numpy((hand.actuator_lower + hand.actuator_upper) / 2)
+        self.free = ActuationMap(hand).free_motion(middle).numpy()
         self.looks: list[Observation] = []
 
     def rows(self) -> Iterator[Check]:

@@ -52,6 +52,8 @@ class GraspForces:
     expected: the smallest forces are a choice, not an estimate."""
     margin_std: Float[Tensor, "*batch n_c"] | None = None
     """Standard deviation of ``margin`` [N]; None likewise."""
+    loop: Float[Tensor, "*batch n_l"] | None = None
+    """Forces of the loops, ``(dc/dq)^T nu`` on the joints [N]; None: there are none."""
 
     @property
     def solved(self) -> bool:
