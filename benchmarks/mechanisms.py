@@ -58,7 +58,9 @@ def _slack_spring() -> str:
 
 def _routed_flexor() -> str:
     tendon = f"<tendon>{_routed('flexor', _WAY)}</tendon>"
-    motor = '<actuator><position name="motor" tendon="flexor" kp="8000" ctrlrange=".05 .1" forcerange="-1e6 0"/>'
+    motor = (
+        '<actuator><position name="motor" tendon="flexor" kp="8000" ctrlrange=".05 .1" forcerange="-1e6 0"/>'
+    )
     return _hand("routed", _finger('stiffness=".04"', 'stiffness=".03"'), f"{tendon}{motor}</actuator>")
 
 
@@ -118,7 +120,9 @@ def _tied_tendons() -> str:
 
 
 def _two_motors() -> str:
-    tendons = _fixed("flexor", _ARMS) + _routed("extensor", _WAY) + _fixed("stay", {"far": 0.01}, 'stiffness="200"')
+    tendons = (
+        _fixed("flexor", _ARMS) + _routed("extensor", _WAY) + _fixed("stay", {"far": 0.01}, 'stiffness="200"')
+    )
     motors = '<position name="flex" tendon="flexor" kp="9000" ctrlrange="0 .02" forcerange="0 1e6"/>'
     motors += '<position name="hold" tendon="extensor" kp="4000" ctrlrange=".05 .1" forcerange="-1e6 0"/>'
     rest = f"<tendon>{tendons}</tendon><actuator>{motors}</actuator>"

@@ -32,6 +32,9 @@ class Actuator:
     backlash: float = 0.0
     """Play of the drive, from one end to the other [rad]: a reversal of the motor smaller than that moves
     nothing (:class:`~torch_ekm.kinematics.Play`)."""
+    unit: float = 1.0
+    """What one of these rad is in the units of the description's files: 1, or the largest moment arm where
+    positions are lengths of a tendon [m], or angles before a gear. The figures here are in these rad."""
     posture: bool = False
     """True: it shapes the hand before a grasp; a controller leaves it alone while something is held."""
 
@@ -140,6 +143,16 @@ class HandDescription:
     def lengths(self) -> Lengths:
         """``a = offset + l(q)``, with the arms of ``actuation_jacobian``."""
         return self.arm_functions or Lengths(self.actuation_jacobian)
+
+    def unloaded(self, q: Array) -> Array:
+        """``offset + l(q)``: where the motors are whose transmissions are not stretched ``(*batch, n_a)``."""
+        return self.actuator_offset + self.lengths.length(q, self.actuation_jacobian)
+
+    def bent(self, q: Array) -> Array:
+        """``l(q) - J_a q``: what typical moment arms do not say of the lengths ``(*batch, n_a)``."""
+        if self.lengths.constant:
+            return np.zeros((*q.shape[:-1], self.n_a))
+        return self.lengths.length(q, self.actuation_jacobian) - q @ self.actuation_jacobian.T
 
     @property
     def urdf_path(self) -> Path:

@@ -87,7 +87,7 @@ class WiringTest:
         beyond = np.maximum(hand.actuator_lower - a, a - hand.actuator_upper)
         joints = np.maximum(hand.joint_lower - q, q - hand.joint_upper)[self.sensed]
         parts = [np.maximum(np.concatenate([beyond, joints]), 0) / _RANGE]
-        parts.append(np.abs(a - hand.actuator_offset - J_a @ q)[rows] / _STATIC)
+        parts.append(np.abs(a - hand.unloaded(q))[rows] / _STATIC)
         for motion in readings.motions:
             noise = np.sqrt(J_a**2 @ motion.noise**2)
             parts.append(_off(J_a @ motion.q, motion.a, noise)[rows])

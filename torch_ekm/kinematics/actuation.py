@@ -41,9 +41,8 @@ class ActuationMap(nn.Module):
         """
         self._check("q", q, self.hand.joint_names)
         hand, at = self.hand, q.detach().double().cpu().numpy()
-        length = hand.actuator_offset + hand.lengths.length(at, hand.actuation_jacobian)
         arms = hand.lengths.jacobian(at, hand.actuation_jacobian)
-        return _along(q, at, length, arms)
+        return _along(q, at, hand.unloaded(at), arms)
 
     def joints(self, a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_q"]:
         """Posture of the hand that touches nothing [rad].

@@ -80,7 +80,7 @@ class FreeHand:
         self._fixed = np.vstack([C, np.eye(n_q)])
         self._straight = hand.lengths.constant and springs is None and loops is None
         q0 = np.clip(hand.spring_rest, hand.joint_lower, hand.joint_upper)
-        self._slack = hand.actuator_offset + hand.lengths.length(q0, hand.actuation_jacobian)
+        self._slack = hand.unloaded(q0)
         self._start = q0, np.zeros(len(self._low))
 
     def __call__(self, a: Array) -> Rest:
@@ -110,7 +110,7 @@ class FreeHand:
     def _rows(self, q: Array) -> tuple[Array, Array]:
         """Values of the rows, and their derivatives."""
         hand = self._hand
-        value = [hand.actuator_offset + hand.lengths.length(q, hand.actuation_jacobian)]
+        value = [hand.unloaded(q)]
         slope = [hand.lengths.jacobian(q, hand.actuation_jacobian)]
         for part in (hand.tendon_springs, hand.loops):
             if part is not None:

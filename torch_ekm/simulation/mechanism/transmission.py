@@ -12,7 +12,7 @@ from ...typing import Array
 from .departures import CableLosses, JointShape
 
 _COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
-_LOOP_STIFFNESS = 30.0  # [N m/rad] at the joints of a loop
+_LOOP_STIFFNESS = 100.0  # [N m/rad] at the joints of a loop: as rigid as an actuator may be
 _BRISTLE_STIFFNESS = 3.0  # k_f [N m/rad]
 _LEANS = 5e-3  # [N m] from which a joint with play is at its end; smooth, as a planner needs it
 _STIFF = 20.0  # [N m/rad] at a joint; up to here the late part damps little
@@ -42,7 +42,7 @@ class Transmission:
     same drive. PhysX's own joint friction is a fraction of the momentum, not a torque: not used.
 
     Moment arms may change with the posture: ``J_a q`` is then ``l(q)``. Springs over tendons pull along
-    ``dl/dq``; loops are held by springs of 30 N m/rad at their joints.
+    ``dl/dq``; loops are held by springs of 100 N m/rad at their joints.
 
     Pulleys that are not round and springs that are not linear (``shape``) put ``h(q)`` in the place of q at
     the tendons, ``h'(q)`` on their arms, and ``x (1 + s x^2)`` in the place of ``q - q0``. Friction of the
