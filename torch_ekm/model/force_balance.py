@@ -62,7 +62,7 @@ class ForceBalance:
 
     def _arms(self, arms: Arms = _SAME) -> Array:
         """``(J_a Z)^T`` as it is now: calibration changes the moment arms."""
-        J_a = arms.of(self.reduction.actuation.detach()).double().cpu().numpy()
+        J_a = arms.of(self.reduction.actuation).detach().double().cpu().numpy()
         return (J_a @ self.joint_basis).T
 
     def held_by_stops(
@@ -201,7 +201,7 @@ class ForceBalance:
         n_q, batch = V_s.shape[-1] - 6, mu.dim() - 1
         V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
         Z, Z_p, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.pose_basis, self.lift))
-        J_a = [(arms.one(k).of(self.reduction.actuation) @ Z).mT for k in range(len(problems))]
+        at = [arms.one(k) for k in range(len(problems))]
         G, load, hand, V_z = -Z_p.mT @ A[..., n_q:].mT, V_p @ Z_p, Z.mT @ A[..., :n_q].mT, V_q @ Z
         results = []
         for k, (eq, solution) in enumerate(problems):
@@ -209,7 +209,13 @@ class ForceBalance:
             forces = tuple(own[:3])
             if solution.status is ForceStatus.SOLVED:
                 *forces, e = differentiable_forces(
-                    eq, self.options.forces, solution, *own[3:6], actuator_matrix=J_a[k], hand_load=own[6]
+                    eq,
+                    self.options.forces,
+                    solution,
+                    *own[3:6],
+                    actuator_matrix=(at[k].of(self.reduction.actuation) @ Z).mT,
+                    hand_load=own[6],
+                    closed=None if at[k].closed is None else (at[k].closed @ Z).mT,
                 )
                 forces = (*forces, lift @ e)
             results.append(forces)

@@ -1,0 +1,78 @@
+"""A grasp whose moment arms change, with tendon springs and loops: against differences of equilibria."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from made_hands import write_hand
+
+from torch_ekm.description import load_hand, load_object
+from torch_ekm.kinematics.grasp_state import GraspState
+from torch_ekm.model import ContactMotion, KinematicModel
+from torch_ekm.simulation import PlantConfig, PlantParameters
+from torch_ekm.simulation.grasp_planning.pinch import PinchRequest, pinch_problem, plan_pinch
+
+
+@pytest.fixture(scope="module", params=["round", "tendon_springs", "not_round", "four_bar"])
+def motion(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> ContactMotion:
+    """A planned pinch, settled in the model's own equilibrium."""
+    hand = load_hand(write_hand(request.param, tmp_path_factory.mktemp("hands")))
+    obj = load_object("can")
+    plan = plan_pinch(
+        pinch_problem(hand, obj, PlantConfig(), PlantParameters()), PinchRequest(hand.pinch_force)
+    )
+    state = GraspState(*(torch.from_numpy(x) for x in (plan.q, plan.position, plan.rotation)))
+    model = KinematicModel(hand, obj)
+    start = model.linearize(state, model.touching(state), on_unstable="flag")
+    motion = ContactMotion(model, start, a=torch.from_numpy(plan.motor))
+    motion.move(torch.zeros(hand.n_a, dtype=torch.float64))
+    return motion
+
+
+def moved(motion: ContactMotion, way: torch.Tensor) -> torch.Tensor:
+    return copy.copy(motion).move(way).increment
+
+
+def test_the_jacobian_is_that_of_differences_of_the_equilibrium(motion: ContactMotion) -> None:
+    n_a, h = motion.model.hand.n_a, 1e-5
+    eye = torch.eye(n_a, dtype=torch.float64)
+    columns = [(moved(motion, h * one) - moved(motion, -h * one)) / (2 * h) for one in eye]
+    differences = torch.stack(columns, dim=1)
+    exact = copy.copy(motion).linearize(1e-9 * eye[0]).manipulation_jacobian
+    torch.testing.assert_close(exact, differences, atol=2e-5 * float(differences.abs().max()), rtol=0)
+
+
+def test_the_model_says_the_same_where_contacts_stick(motion: ContactMotion) -> None:
+    """J_m with the forces of the equilibrium, from the stiffness and the moment arms there."""
+    model, n_a = motion.model, motion.model.hand.n_a
+    inside = copy.copy(motion).linearize(torch.zeros(n_a, dtype=torch.float64))
+    lin = model.linearize(motion.state, inside.contacts, forces=inside.forces)
+    scale = float(inside.manipulation_jacobian.abs().max())
+    torch.testing.assert_close(
+        lin.manipulation_jacobian, inside.manipulation_jacobian, atol=2e-4 * scale, rtol=0
+    )
+
+
+def test_the_slope_of_j_m_along_the_state_is_that_of_differences(motion: ContactMotion) -> None:
+    """Autograd through changing arms: the joints' torques that the actuators give."""
+    model, state = motion.model, motion.state
+    contacts = model.contacts(state)
+    q = state.q.clone().requires_grad_()
+    forces = model.linearize(GraspState(q, state.position, state.rotation), contacts).forces
+    (slope,) = torch.autograd.grad(forces.normal.sum(), q)
+    h, eye = 1e-6, torch.eye(len(q), dtype=torch.float64)
+    found = []
+    for one in eye:
+        ends = [
+            model.linearize(GraspState(state.q + s * h * one, state.position, state.rotation), contacts)
+            for s in (1, -1)
+        ]
+        found.append((ends[0].forces.normal.sum() - ends[1].forces.normal.sum()) / (2 * h))
+    torch.testing.assert_close(slope, torch.stack(found), atol=2e-3, rtol=1e-3)
