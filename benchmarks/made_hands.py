@@ -116,12 +116,31 @@ def _four_bar() -> tuple[str, str]:
 
 
 def _servos() -> tuple[str, str]:
-    motors = "".join(
-        f'[[actuators]]\nname = "m_{joint}"\nrange = [-0.5, 1.5]\nmoment_arms = {{ {joint} = 1.0 }}\n'
-        "stiffness = 10.0\n"
-        for joint in _springs()
-    )
-    return _gripper(), _head(_springs(0.0, 0.0)) + motors + _pads()
+    """Sixteen motors on sixteen joints, nothing else: a thumb against three fingers, in space."""
+    parts, motors, joints, pads = ['<link name="palm"/>'], "", {}, ""
+    for name, x, y, side in (
+        ("thumb", 0.06, 0.0, -1), ("index", 0.0, -0.028, 1), ("middle", 0.0, 0.0, 1), ("ring", 0.0, 0.028, 1)
+    ):  # fmt: skip
+        before, at = "palm", f"{x} {y} 0.01"
+        for k, (axis, low, high) in enumerate((("0 0 1", -0.4, 0.4), *3 * [(f"0 {side} 0", -0.3, 1.5)])):
+            joint, link = f"{name}_{k}", f"{name}_link_{k}"
+            ends = f'<parent link="{before}"/><child link="{link}"/><origin xyz="{at}"/><axis xyz="{axis}"/>'
+            limit = f'<limit lower="{low}" upper="{high}" effort="2" velocity="3"/>'
+            parts.append(f'<joint name="{joint}" type="revolute">{ends}{limit}</joint>')
+            long = (0.0, 0.04, 0.03, 0.025)[k]
+            ball = '<geometry><sphere radius="0.008"/></geometry>'
+            tip = f'<collision><origin xyz="0 0 {long}"/>{ball}</collision>' if k == 3 else ""
+            inertia = '<inertia ixx="2e-6" ixy="0" ixz="0" iyy="2e-6" iyz="0" izz="2e-6"/>'
+            parts.append(
+                f'<link name="{link}"><inertial><mass value="0.01"/>{inertia}</inertial>{tip}</link>'
+            )
+            before, at, joints[joint] = link, f"0 0 {long}", 0.0
+            motors += f'[[actuators]]\nname = "m_{joint}"\nrange = [{low}, {high}]\n'
+            motors += f"moment_arms = {{ {joint} = 1.0 }}\nstiffness = 10.0\n"
+        pads += f'[[pads]]\nname = "{name}"\nlink = "{before}"\nstart = [0, 0, 0.025]\nradius = 0.008\n'
+        pads += f"direction = [{side}, 0, 0]\n"
+    head = _head(joints).replace("planar_normal = [0, 0, 1]\n", "")
+    return "".join(parts), head + motors + pads
 
 
 def _stiff() -> tuple[str, str]:
@@ -142,15 +161,27 @@ def _idle() -> tuple[str, str]:
     return _gripper(more), _head(_springs(), preloaded) + _both("1.0", "0.8") + motor + _pads()
 
 
-_MADE: tuple[Callable[[], tuple[str, str]], ...] = (
-    _round, _tendon_springs, _not_round, _four_bar, _servos, _stiff, _metres, _idle,
-)  # fmt: skip
-KINDS = tuple(make.__name__[1:] for make in _MADE)
+def _jaw() -> tuple[str, str]:
+    """A finger on a slide, which is set by hand: the width of the grip."""
+    links, transmission = _round()
+    slide = '<joint name="slide" type="prismatic"><parent link="hand"/><child link="jaw"/><axis xyz="1 0 0"/>'
+    slide += '<limit lower="-0.01" upper="0.01" effort="10" velocity="1"/></joint>'
+    child = '<child link="left_near"/>'
+    links = links.replace(f'<parent link="hand"/>{child}', f'<parent link="jaw"/>{child}')
+    return links + slide + _link("jaw", 0.005), transmission
+
+
+_MADE: dict[str, Callable[[], tuple[str, str]]] = {
+    "tendon_springs": _tendon_springs, "four_bar": _four_bar, "not_round": _not_round, "servos": _servos,
+    "stiff": _stiff, "metres": _metres, "jaw": _jaw, "idle": _idle, "round": _round,
+}  # fmt: skip
+KINDS = tuple(_MADE)[:8]
+"""Eight kinds of hands; "round" is none of them but a reference."""
 
 
 def write_hand(kind: str, folder: Path) -> Path:
     """The URDF of a hand of this kind, with its transmission file next to it."""
-    links, transmission = _MADE[KINDS.index(kind)]()
+    links, transmission = _MADE[kind]()
     path = folder / f"{kind}.urdf"
     path.write_text(f'<robot name="{kind}">{links}</robot>')
     path.with_suffix(".transmission.toml").write_text(transmission)
@@ -158,7 +189,7 @@ def write_hand(kind: str, folder: Path) -> Path:
 
 
 def write_hands(folder: Path) -> Iterator[Path]:
-    """All of them."""
+    """All eight."""
     folder.mkdir(parents=True, exist_ok=True)
     for kind in KINDS:
         yield write_hand(kind, folder)
