@@ -350,7 +350,7 @@ class _Checked:
         return sorted(found, key=lambda one: one[0])
 
     def _unexplained(self, readings: Readings) -> Check:
-        off = readings.a - self.hand.actuator_offset - self.hand.actuation_jacobian @ readings.q
+        off = readings.a - self.hand.unloaded(readings.q)
         i = int(np.argmax(np.where(self.test.rows, np.abs(off), 0)))
         name = self.hand.actuator_names[i]
         found = (

@@ -68,7 +68,7 @@ def new_wiring(port: str, hand: str, bauds: tuple[int, ...] = BAUDS) -> str:
         problem = f"{len(ids)} servos answer at {baud} baud ({', '.join(said)})"
         raise BusError(port, f"{problem}; {hand} has {len(names)} actuators: {', '.join(names)}")
     rest = np.clip(description.spring_rest, description.joint_lower, description.joint_upper)
-    a = description.actuator_offset + description.actuation_jacobian @ rest
+    a = description.unloaded(rest)
     most = min(
         one["Current Limit"] * (model.unit_ma if model else 0)
         for one, model in zip(found, models, strict=True)

@@ -75,16 +75,12 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
 
 
 def view_hand(hand: HandDescription) -> View:
-    """``q(a) = argmin 1/2 (q - q0)^T K_s (q - q0)  s.t.  J_a q = a - a_0,  C (q - q0) = 0``.
-
-    Each actuator closes and opens. The hand touches nothing; joint stops are kept.
-    """
+    """Where the hand rests that touches nothing, while each actuator closes and opens."""
     upper = np.array([part.upper for part in hand.actuators])
     start = np.clip(0.0, [part.lower for part in hand.actuators], upper)
     ways = np.r_[np.linspace(0, 1, _FRAMES), np.linspace(1, 0, _FRAMES)]
     postures = [start, *(start + way * np.diag(upper - start)[i] for i in range(hand.n_a) for way in ways)]
     q = ActuationMap(hand).joints(torch.from_numpy(np.array(postures))).numpy()
-    q = q.clip(hand.joint_lower, hand.joint_upper)
     scene = make_scene(hand, None, q, None, None, np.array(hand.gravity))
     return View(hand.name, scene, notes=tuple(visuals(hand.urdf).problems))
 

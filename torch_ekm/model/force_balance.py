@@ -208,6 +208,7 @@ class ForceBalance:
             own = [x.reshape(-1, *x.shape[batch:])[k] for x in (mu, lam, residual, G, load, hand, V_z)]
             forces = tuple(own[:3])
             if solution.status is ForceStatus.SOLVED:
+                closed = at[k].closed
                 *forces, e = differentiable_forces(
                     eq,
                     self.options.forces,
@@ -215,7 +216,7 @@ class ForceBalance:
                     *own[3:6],
                     actuator_matrix=(at[k].of(self.reduction.actuation) @ Z).mT,
                     hand_load=own[6],
-                    closed=None if at[k].closed is None else (at[k].closed @ Z).mT,
+                    closed=None if closed is None else (closed @ Z).mT,
                 )
                 forces = (*forces, lift @ e)
             results.append(forces)
