@@ -177,8 +177,7 @@ def test_a_spatial_tendon_is_measured_by_mujoco(tmp_path: Path) -> None:
     hand = load_hand(written(tmp_path, SPATIAL.format(most=150)))
     # it shortens to pull: `a` is the negative length here
     assert hand.actuators[0].tendon
-    unit = hand.actuators[0].unit
-    assert unit * hand.actuators[0].lower == pytest.approx(-0.05)
+    assert hand.actuators[0].lower == pytest.approx(-0.05)
     model, data = engine(tmp_path / "hand.xml")
     for angle in (0.1, 1.2):
         data.qpos[:] = angle
@@ -186,8 +185,8 @@ def test_a_spatial_tendon_is_measured_by_mujoco(tmp_path: Path) -> None:
         q = np.full(hand.n_q, angle)
         J_a = hand.actuation_jacobian
         length, arms = hand.lengths.length(q, J_a), hand.lengths.jacobian(q, J_a)[0]
-        np.testing.assert_allclose(unit * length, [-data.ten_length[0]], atol=1e-14)
-        np.testing.assert_allclose(unit * arms, -data.ten_J[: hand.n_q], atol=1e-14)
+        np.testing.assert_allclose(length, [-data.ten_length[0]], atol=1e-14)
+        np.testing.assert_allclose(arms, -data.ten_J[: hand.n_q], atol=1e-14)
 
 
 def test_a_template_is_filled_in_and_has_the_last_word(tmp_path: Path) -> None:

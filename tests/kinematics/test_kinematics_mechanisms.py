@@ -98,10 +98,10 @@ def test_a_table_of_arms_is_a_smooth_curve_with_its_exact_integral() -> None:
 
 def test_a_hand_is_written_with_its_functions_and_in_its_own_units(tmp_path: Path) -> None:
     for kind in ("not_round", "metres", "tendon_springs", "four_bar"):
-        hand = load_hand(write_hand(kind, tmp_path))
+        hand = load_hand(write_hand(kind, tmp_path)).counted()
         again = load_hand(
             write_transmission(hand, tmp_path / f"{kind}_2.transmission.toml").with_name(f"{kind}_2.urdf")
-        )
+        ).counted()
         q = np.linspace(0.2, 0.9, hand.n_q)
         np.testing.assert_allclose(again.unloaded(q), hand.unloaded(q), atol=1e-12)
         assert [one.unit for one in again.actuators] == [one.unit for one in hand.actuators]
@@ -113,7 +113,7 @@ def test_a_hand_is_written_with_its_functions_and_in_its_own_units(tmp_path: Pat
 
 
 def test_metres_of_tendon_count_as_the_angle_of_the_spool(tmp_path: Path) -> None:
-    metres, angles = (load_hand(write_hand(kind, tmp_path)) for kind in ("metres", "round"))
+    metres, angles = (load_hand(write_hand(kind, tmp_path)).counted() for kind in ("metres", "round"))
     assert {one.unit for one in metres.actuators} == {0.01}
     np.testing.assert_allclose(metres.actuation_jacobian, angles.actuation_jacobian, rtol=1e-12)
     for mine, its in zip(metres.actuators, angles.actuators, strict=True):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,8 @@ from ..exceptions import DescriptionError
 from ..typing import Array
 from .lengths import Lengths, Loops, TendonSprings
 from .urdf import UrdfModel
+
+_ANGLES = (0.1, 10.0)  # a largest moment arm of a motor between these is a ratio of angles
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,7 @@ class Actuator:
     """Play of the drive, from one end to the other [rad]: a reversal of the motor smaller than that moves
     nothing (:class:`~torch_ekm.kinematics.Play`)."""
     unit: float = 1.0
-    """What one of these rad is in the units of the description's files: 1, or the largest moment arm where
-    positions are lengths of a tendon [m], or angles before a gear. The figures here are in these rad."""
+    """What 1 is in the units of the files; see :meth:`HandDescription.counted`."""
     posture: bool = False
     """True: it shapes the hand before a grasp; a controller leaves it alone while something is held."""
 
@@ -143,6 +144,28 @@ class HandDescription:
     def lengths(self) -> Lengths:
         """``a = offset + l(q)``, with the arms of ``actuation_jacobian``."""
         return self.arm_functions or Lengths(self.actuation_jacobian)
+
+    def counted(self) -> HandDescription:
+        """The same hand with each motor in a unit of its own, as plants, models and controllers count.
+
+        A motor whose largest moment arm is below 0.1 or above 10 counts in lengths of its tendon, or in turns
+        before a gear: 1 is then the largest arm of it, so that its position is an angle. Others stay in rad.
+        """
+        largest = np.abs(self.actuation_jacobian).max(axis=1)
+        unit = np.where((largest < _ANGLES[0]) | (largest > _ANGLES[1]), largest, 1.0)
+        if (unit == 1.0).all():
+            return self
+        actuators = [
+            replace(
+                one,
+                **{name: getattr(one, name) / u for name in ("lower", "upper", "offset", "backlash")},
+                stiffness=one.stiffness * u**2,
+                unit=one.unit * u,
+            )
+            for one, u in zip(self.actuators, unit.tolist(), strict=True)
+        ]
+        J_a = self.actuation_jacobian / unit[:, None]
+        return replace(self, actuators=tuple(actuators), actuation_jacobian=J_a)
 
     def unloaded(self, q: Array) -> Array:
         """``offset + l(q)``: where the motors are whose transmissions are not stretched ``(*batch, n_a)``."""

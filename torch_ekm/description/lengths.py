@@ -97,8 +97,9 @@ class Lengths:
     def _at(self) -> tuple[list[int], list[int]]:
         return [row for row, *_ in self.functions], [joint for _, joint, _ in self.functions]
 
-    def length(self, q: Array, arms: Array) -> Array:
+    def length(self, q: Array, arms: Array | None = None) -> Array:
         """``l(q)`` ``(*batch, n)``, 0 at zero angles where no tendon has a way of its own."""
+        arms = self.typical if arms is None else arms
         found = q @ arms.T
         if self.functions:
             rows, joints = self._at
@@ -125,9 +126,9 @@ class Lengths:
             found[..., at, :] = np.divide(J, whole, out=np.ones_like(J), where=whole != 0)
         return found
 
-    def jacobian(self, q: Array, arms: Array) -> Array:
+    def jacobian(self, q: Array, arms: Array | None = None) -> Array:
         """``dl/dq`` ``(*batch, n, n_q)``."""
-        return arms * self.ratio(q)
+        return (self.typical if arms is None else arms) * self.ratio(q)
 
     def slope(self, q: Array) -> Array:
         """``d ratio_ij/dq_k`` ``(*batch, n, n_q, n_q)``."""
@@ -145,12 +146,13 @@ class Lengths:
             found[..., at, :, :] = np.divide(change, whole, out=np.zeros_like(change), where=whole != 0)
         return found
 
-    def curvature(self, q: Array, weight: Array, arms: Array) -> Array:
+    def curvature(self, q: Array, weight: Array, arms: Array | None = None) -> Array:
         """``sum_i w_i d2l_i/dq2`` ``(*batch, n_q, n_q)``, symmetric.
 
         Args:
             weight: ``(*batch, n)``.
         """
+        arms = self.typical if arms is None else arms
         found = np.einsum("...i,ij,...ijk->...jk", weight, arms, self.slope(q))
         return (found + found.swapaxes(-1, -2)) / 2
 
@@ -241,20 +243,18 @@ class TendonSprings:
 
     def tension(self, q: Array) -> Array:
         """Pull of each tendon ``(*batch, n)`` [N]; negative: it pushes."""
-        length = self.lengths.length(q, self.lengths.typical)
+        length = self.lengths.length(q)
         return self.stiffness * (length - np.clip(length, self.low, self.high))
 
     def torque(self, q: Array) -> Array:
         """``dV/dq`` ``(*batch, n_q)`` [N m]."""
-        J = self.lengths.jacobian(q, self.lengths.typical)
-        return (self.tension(q)[..., None, :] @ J)[..., 0, :]
+        return (self.tension(q)[..., None, :] @ self.lengths.jacobian(q))[..., 0, :]
 
     def stiffness_matrix(self, q: Array) -> Array:
         """``d2V/dq2 = J^T k J + sum_t tension_t d2l_t/dq2`` ``(*batch, n_q, n_q)`` [N m/rad]."""
-        tension, J = self.tension(q), self.lengths.jacobian(q, self.lengths.typical)
+        tension, J = self.tension(q), self.lengths.jacobian(q)
         k = np.where(tension != 0, self.stiffness, np.where(self.low == self.high, self.stiffness, 0.0))
-        bends = self.lengths.curvature(q, tension, self.lengths.typical)
-        return J.swapaxes(-1, -2) @ (k[..., None] * J) + bends
+        return J.swapaxes(-1, -2) @ (k[..., None] * J) + self.lengths.curvature(q, tension)
 
 
 @dataclass(frozen=True)
@@ -267,15 +267,7 @@ class Loops:
 
     def gap(self, q: Array) -> Array:
         """``c(q)`` ``(*batch, n)``."""
-        return self.lengths.length(q, self.lengths.typical) - self.value
-
-    def jacobian(self, q: Array) -> Array:
-        """``dc/dq`` ``(*batch, n, n_q)``."""
-        return self.lengths.jacobian(q, self.lengths.typical)
-
-    def curvature(self, q: Array, force: Array) -> Array:
-        """``sum_i f_i d2c_i/dq2`` ``(*batch, n_q, n_q)``."""
-        return self.lengths.curvature(q, force, self.lengths.typical)
+        return self.lengths.length(q) - self.value
 
 
 def typical_arms(routed: Routed, lower: Array, upper: Array, rest: Array) -> Array:

@@ -259,9 +259,8 @@ class _Conversion:
             table["mjcf_tendons"] = {self._tendon_name(tendon): sign * gear}
         table["tendon"] = bool(pulls_back or low >= 0)
         if int(model.actuator_trntype[k]) == kinds.mjTRN_TENDON and np.abs(row).max() < 0.1:
-            self.notes.append(
-                f"'{name}' counts in the length of its tendon, here in units of its largest arm"
-            )
+            told = "plants and models count in its largest arm"
+            self.notes.append(f"'{name}' counts in the length of its tendon, not in rad; {told}")
         return table
 
     def _driven(self, k: int, name: str, actuated: set[int]) -> tuple[Array, float, float, int | None]:

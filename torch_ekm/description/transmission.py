@@ -6,7 +6,6 @@ contact pads, Hall sensors. The format is documented in ``docs/reference/file_fo
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -35,7 +34,6 @@ ACTUATOR = (
 COUPLING = ("name", "joints")
 PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
 HALL = ("joint", "channel", "open", "closed")
-_ANGLES = (0.1, 10.0)  # a largest moment arm of a motor between these is a ratio of angles
 T = TypeVar("T")
 
 
@@ -75,9 +73,7 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     tendon_springs = reader.springs(_each(top, "tendon_springs", _of(path, SPRING)))
     loops = reader.loops(_each(top, "loops", _of(path, LOOP)))
     couplings = _each(top, "couplings", lambda place, data: TomlTable(path, place, data, COUPLING))
-    units = [_unit(row) for row in lengths.typical]
-    actuators = [_in_units(one, unit) for one, unit in zip(actuators, units, strict=True)]
-    J_a = lengths.typical / np.array(units)[:, None]
+    J_a = lengths.typical
     C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
     K_s = springs[:, 0]
     check_mimics(path, urdf.path, urdf.mimics, names, C, springs[:, 1])
@@ -86,7 +82,7 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
         arms = tendon_springs.lengths.typical
         K = K + arms.T @ (tendon_springs.stiffness[:, None] * arms)
     if loops is not None:
-        closed = loops.jacobian(springs[:, 1])
+        closed = loops.lengths.jacobian(springs[:, 1])
     _check_mechanism(path, names, J_a, C, K, closed)
     pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
     hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
@@ -141,17 +137,6 @@ def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
     left = [place for key, value in data.items() for place in places(value, key)]
     if left:
         raise DescriptionError(path, f"still to be filled in ({len(left)} figures): {', '.join(left)}")
-
-
-def _unit(arms: np.ndarray) -> float:
-    """What of a motor's position turns the joint that it moves least easily by 1 rad, if that is no angle."""
-    largest = float(np.abs(arms).max())
-    return largest if not _ANGLES[0] <= largest <= _ANGLES[1] else 1.0
-
-
-def _in_units(one: Actuator, unit: float) -> Actuator:
-    parts = {name: getattr(one, name) / unit for name in ("lower", "upper", "offset", "backlash")}
-    return dataclasses.replace(one, **parts, stiffness=one.stiffness * unit**2, unit=unit)
 
 
 def _each(top: TomlTable, key: str, read: Callable[[str, Any], T], minimum: int = 0) -> list[T]:

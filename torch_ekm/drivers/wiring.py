@@ -161,7 +161,7 @@ class Wiring:
             name = head.text("description")
             beside = path.parent / name
             try:
-                hand = load_hand(beside if beside.suffix in HAND_FILES else name)
+                hand = load_hand(beside if beside.suffix in HAND_FILES else name).counted()
             except UnknownNameError as error:
                 raise head.error(f"'description': {error}") from None
 

@@ -55,7 +55,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         The checks in the order in which faults are best corrected. A fault ends in a row, never in an error.
     """
     try:
-        description = load_hand(hand)
+        description = load_hand(hand).counted()
     except (EKMError, OSError) as error:
         return [Check("hand's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]

@@ -51,7 +51,7 @@ def new_wiring(port: str, hand: str, bauds: tuple[int, ...] = BAUDS) -> str:
         BusError: no servo answers, or not as many as the hand has actuators; the message lists them.
         UnknownNameError, DescriptionError: there is no such hand.
     """
-    description = load_hand(hand)
+    description = load_hand(hand).counted()
     for baud in bauds:
         bus = DynamixelPort(port, baud)
         try:

@@ -65,7 +65,7 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
     if object is None:
         if reach:
             raise ParameterError("reach", reach, "False without an object: it is that of a grasp")
-        return view_hand(load_hand(what))
+        return view_hand(load_hand(what).counted())
     plant = SimulatedHand(what, object)
     try:
         seen = plant.reset(seed)
@@ -153,7 +153,7 @@ def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool 
     for name in ("hand", "object"):
         if not isinstance(configuration.get(name), str):
             raise DescriptionError(log, f"its configuration names no {name}, needed to draw it")
-    hand, obj = load_hand(configuration["hand"]), load_object(configuration["object"])
+    hand, obj = load_hand(configuration["hand"]).counted(), load_object(configuration["object"])
     gravity = np.array(configuration.get("gravity", hand.gravity), dtype=np.float64)
     states = [seen.state if estimates else _truth(seen) for seen in trajectory.observations]
     if states[0].q.shape[-1] != hand.n_q:

@@ -52,10 +52,6 @@ class FreeHand:
     with a row r for each drive, tendon spring, coupling, loop and stop: its value v, its compliance c, and
     the interval in which it has no force. The primal-dual active set decides which rows have one. The
     projector dq/da follows from the implicit function theorem.
-
-    Args:
-        hand: whose.
-        drives: rigid ones in place of compliant ones, if False.
     """
 
     def __init__(self, hand: HandDescription) -> None:
@@ -114,8 +110,8 @@ class FreeHand:
         slope = [hand.lengths.jacobian(q, hand.actuation_jacobian)]
         for part in (hand.tendon_springs, hand.loops):
             if part is not None:
-                value.append(part.lengths.length(q, part.lengths.typical))
-                slope.append(part.lengths.jacobian(q, part.lengths.typical))
+                value.append(part.lengths.length(q))
+                slope.append(part.lengths.jacobian(q))
         return np.concatenate([*value, self._fixed @ q]), np.vstack([*slope, self._fixed])
 
     def _bends(self, q: Array, f: Array) -> Array:
@@ -125,7 +121,7 @@ class FreeHand:
         for part in (hand.tendon_springs, hand.loops):
             if part is not None:
                 n = len(part.names)
-                found = found + part.lengths.curvature(q, f[first : first + n], part.lengths.typical)
+                found = found + part.lengths.curvature(q, f[first : first + n])
                 first += n
         return found
 
@@ -144,8 +140,8 @@ class FreeHand:
             end = np.where(at < low, low, np.where(at > high, high, np.nan))
             end = np.where(low == high, low, end)
             active = np.flatnonzero(~np.isnan(end))
-            if (active >= n_stop).any():
-                compliance[self._rigid] = _SOFT * unit[self._rigid]
+            pressed = (active >= n_stop).any()
+            compliance[self._rigid] = _SOFT * unit[self._rigid] if pressed else 0.0
             state = end[active].tobytes() + active.tobytes()
             if self._straight and state != last and state in seen:
                 return None  # it goes round in a circle

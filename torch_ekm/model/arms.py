@@ -40,7 +40,7 @@ def arms_at(hand: HandDescription, q: Float[AnyArray, "*batch n_q"]) -> Arms:
     """At a posture, with derivatives where it asks for them."""
     lengths, loops = hand.lengths, hand.loops
     ratio = None if lengths.constant else over_posture(q, lengths.ratio)
-    return Arms(ratio, None if loops is None else over_posture(q, loops.jacobian))
+    return Arms(ratio, None if loops is None else over_posture(q, loops.lengths.jacobian))
 
 
 def bends(
@@ -48,7 +48,7 @@ def bends(
     q: Float[AnyArray, "*batch n_q"],
     actuation: Float[AnyArray, "n_a n_q"],
     lam: Float[AnyArray, "*batch n_a"],
-    loop: Float[AnyArray, "*batch n_l"] | None,
+    loop: Float[AnyArray, "*batch n_l"],
 ) -> Any:
     """``sum_i lam_i d2l_i/dq2 + sum_k nu_k d2c_k/dq2`` ``(*batch, n_q, n_q)``; 0 where no arm changes.
 
@@ -58,7 +58,7 @@ def bends(
         loop: nu, forces of the loops.
     """
     parts = [] if hand.lengths.constant else [(hand.lengths, lam, actuation)]
-    if hand.loops is not None and loop is not None:
+    if hand.loops is not None and loop.shape[-1]:
         typical = like(torch.from_numpy(hand.loops.lengths.typical).to(torch.as_tensor(q)), q)
         parts.append((hand.loops.lengths, loop, typical))
     total: Any = 0.0

@@ -173,7 +173,6 @@ class ForceBalance:
         if isinstance(q, Tensor):
             parts = {name: torch.from_numpy(value).to(q) for name, value in parts.items()}
         parts["violation"] = parts["violation"][..., 0]
-        parts |= {} if closed is not None else {"loop": None}
         inputs = (*given, self.reduction.actuation)
         if isinstance(q, Tensor) and torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
             moving = self._with_graph(problems, arms, *given, *(parts[name] for name in names[:3]))
@@ -243,8 +242,6 @@ def pack_forces(kin: ContactKinematics, mu: AnyArray, lam: AnyArray, **rest) -> 
     force = (kin.frame @ full[..., :3, None])[..., 0]
     parts = {"mu": mu, "lam": lam, "force": force, "spin_moment": full[..., 3], "normal": full[..., 0]}
     status, parts = rest.pop("status"), parts | rest
-    if parts.get("loop") is None:
-        parts.pop("loop", None)
     return GraspForces(**{name: torch.as_tensor(part) for name, part in parts.items()}, status=status)
 
 

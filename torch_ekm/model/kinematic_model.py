@@ -53,7 +53,8 @@ class KinematicModel(nn.Module):
     quasi-static equilibrium; ``docs/explanation/quasi_static_model.md`` has the derivation.
 
     Args:
-        hand: the hand; its gravity is the model's.
+        hand: the hand, whose motors count as :meth:`HandDescription.counted` has them; its gravity is the
+            model's.
         obj: the object: its mass, centre of mass and surfaces.
         options: what to take into account.
         kinematics: in place of :class:`~torch_ekm.kinematics.HandKinematics`.
@@ -93,6 +94,7 @@ class KinematicModel(nn.Module):
         super().__init__()
         check_described(hand, obj)
         check_inertia(obj)
+        hand = hand.counted()
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
         self.kinematics = HandKinematics(hand, dtype=dtype) if kinematics is None else kinematics
         if detector is None:

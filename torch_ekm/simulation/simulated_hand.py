@@ -94,7 +94,7 @@ class SimulatedHand:
         if engine not in ENGINES:
             raise UnknownNameError("engine", engine, ENGINES)
         self.engine = engine
-        self.hand = load_hand(hand) if isinstance(hand, str | Path) else hand
+        self.hand = (load_hand(hand) if isinstance(hand, str | Path) else hand).counted()
         self.object = load_object(object) if isinstance(object, str | Path) else object
         self.config = PlantConfig() if config is None else config
         if self.config.gravity is not None:

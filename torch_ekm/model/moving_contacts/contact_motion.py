@@ -390,8 +390,8 @@ def _add(total: dict[str, float], more: dict[str, float]) -> None:
 
 def _loads(lin: Linearization) -> ContactLoads:
     forces = lin.forces
-    force, pull, stop = (x.detach().double().numpy() for x in (forces.force, -forces.lam, forces.stop_torque))
-    loop = np.zeros(0) if forces.loop is None else forces.loop.detach().double().numpy()
+    found = forces.force, -forces.lam, forces.stop_torque, forces.loop
+    force, pull, stop, loop = (x.detach().double().numpy() for x in found)
     return ContactLoads(
         dict(zip(lin.contacts.finger, force, strict=True)),
         dict(zip(lin.contacts.finger, forces.spin_moment.tolist(), strict=True)),

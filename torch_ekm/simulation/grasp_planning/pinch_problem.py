@@ -345,7 +345,7 @@ class PinchProblem:
         """Forces of actuators and loops ``(batch, n)`` and their rows ``(batch, n, n_free)``."""
         rows = self.transmission.arms(g.q)
         if (loops := self.hand.loops) is not None:
-            closed = loops.jacobian(g.q)
+            closed = loops.lengths.jacobian(g.q)
             rows = np.concatenate([np.broadcast_to(rows, (len(closed), *rows.shape[-2:])), closed], axis=1)
         rows = rows @ self._free
         found = np.linalg.pinv(rows.swapaxes(-1, -2), rcond=1e-9) @ (load @ self._free)[..., None]

@@ -207,7 +207,7 @@ class Transmission:
         if self._loops is not None:
             excursion = self.shape.excursion(inner)
             away = self._k_l * self._loops.gap(excursion)
-            torque = torque - self.shape.arm(inner) * (away @ self._loops.jacobian(excursion))
+            torque = torque - self.shape.arm(inner) * (away @ self._loops.lengths.jacobian(excursion))
         if self.losses.any_play:
             whole = torque + self._turned * self._lean
             half = self.losses.play / 2
