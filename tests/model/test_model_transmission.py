@@ -76,3 +76,16 @@ def test_the_slope_of_j_m_along_the_state_is_that_of_differences(motion: Contact
         ]
         found.append((ends[0].forces.normal.sum() - ends[1].forces.normal.sum()) / (2 * h))
     torch.testing.assert_close(slope, torch.stack(found), atol=2e-3, rtol=1e-3)
+
+
+def test_a_batch_is_its_states(motion: ContactMotion) -> None:
+    model, state = motion.model, motion.state
+    contacts = model.contacts(state)
+    names = ("point", "normal", "gap", "finger_curvature", "object_curvature")
+    both = contacts.replace(**{name: torch.stack([getattr(contacts, name)] * 2) for name in names})
+    away = torch.stack([state.q, state.q + 0.01])
+    states = GraspState(away, *(torch.stack([x, x]) for x in (state.position, state.rotation)))
+    found = model.linearize(states, both).manipulation_jacobian
+    for k in range(2):
+        one = model.linearize(GraspState(away[k], state.position, state.rotation), contacts)
+        torch.testing.assert_close(found[k], one.manipulation_jacobian, atol=1e-9, rtol=0)

@@ -36,6 +36,10 @@ class Arms(NamedTuple):
         return Arms(*(None if part is None else part.reshape(-1, *part.shape[-2:])[k] for part in self))
 
 
+SAME = Arms()
+"""Those of the description."""
+
+
 def arms_at(hand: HandDescription, q: Float[AnyArray, "*batch n_q"]) -> Arms:
     """At a posture, with derivatives where it asks for them."""
     lengths, loops = hand.lengths, hand.loops

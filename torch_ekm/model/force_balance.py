@@ -18,13 +18,12 @@ from ..contact.forces.friction import friction_cones, margins
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import AnyArray, Array, Bool, Float, Tensor
-from .arms import Arms
+from .arms import SAME, Arms
 from .gradients import differentiable_forces
 from .grasp_forces import ExpectedForces, ForcePrior, GraspForces, as_states, friction_use, margin_std
 from .options import ModelOptions
 from .reduction import Reduction
 
-_SAME = Arms()
 Mask = NDArray[np.bool_]
 STOP_TOLERANCE = math.radians(0.1)
 """How near to a limit a joint counts as touching its stop [rad]. Joint angles alone cannot tell how much
@@ -60,7 +59,7 @@ class ForceBalance:
         # in a plane the third row of the pose basis is the rotation
         self.moment_rows: Mask = np.any(np.abs(self.pose_basis[3:]) > 1e-9, axis=0)
 
-    def _arms(self, arms: Arms = _SAME) -> Array:
+    def _arms(self, arms: Arms = SAME) -> Array:
         """``(J_a Z)^T`` as it is now: calibration changes the moment arms."""
         J_a = arms.of(self.reduction.actuation).detach().double().cpu().numpy()
         return (J_a @ self.joint_basis).T
@@ -90,7 +89,7 @@ class ForceBalance:
         A: Float[AnyArray, "*batch n_h n_s"],
         V_s: Float[AnyArray, "*batch n_s"],
         *,
-        arms: Arms = _SAME,
+        arms: Arms = SAME,
         normal: Float[AnyArray, "*batch n_c"] | None = None,
         expected: ExpectedForces | None = None,
         last: GraspForces | None = None,

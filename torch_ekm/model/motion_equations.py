@@ -9,7 +9,7 @@ import torch
 
 from .._arrays import is_plain, like
 from ..typing import Bool, Float, Tensor
-from .arms import Arms
+from .arms import SAME, Arms
 from .manipulation import two_stage
 from .reduction import Drives, Reduction
 
@@ -43,7 +43,7 @@ class MotionEquations:
     slack: Bool[Tensor, " n_a"]
     moving: Bool[Tensor, " n_q"]
     """Joints of the fingers that touch."""
-    arms: Arms = Arms()  # noqa: RUF009
+    arms: Arms = SAME
     """Moment arms and loops at the posture."""
 
     def solve(self, springs: Float[Tensor, " n_q"], drives: Drives) -> Motion:

@@ -13,11 +13,10 @@ from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
 from ..kinematics.null_space import null_space
 from ..typing import AnyArray, Bool, Float, Tensor
-from .arms import Arms
+from .arms import SAME, Arms
 from .manipulation import KKTSolution, two_stage
 from .options import ModelOptions
 
-_SAME = Arms()  # those of the description
 _TWO_HARD = "two hard fingers cannot hold anything in space: write planar_normal, or torsional_friction"
 
 
@@ -78,7 +77,7 @@ class Reduction(nn.Module):
         held: Bool[AnyArray, "*batch n_q"],
         slack: Bool[AnyArray, "*batch n_a"],
         on_unstable: str,
-        arms: Arms = _SAME,
+        arms: Arms = SAME,
     ) -> GraspResponse:
         """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
 
@@ -97,28 +96,18 @@ class Reduction(nn.Module):
         """
         if held.ndim == 1:
             return self._solve(D, A, rows, held, slack, on_unstable, arms)
-        if arms.varies:
-            parts_of = (D, A, held, slack)
-            flat = [x.reshape(-1, *x.shape[held.ndim - 1 :]) for x in parts_of]
-            each = [
-                self._solve(D, A, rows, h, s, on_unstable, arms.one(k))
-                for k, (D, A, h, s) in enumerate(zip(*flat, strict=True))
-            ]
-            stacked = [torch.stack([torch.as_tensor(x) for x in part]) for part in zip(*each, strict=True)]
-            motion, contact, actuator, stability = (
-                x.reshape(*held.shape[:-1], *x.shape[1:]) for x in stacked
-            )
-            return motion, contact, actuator, stability
         n_q = held.shape[-1]
         pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
-        if len(pattern) == 1 or bool((pattern == pattern[0]).all()):
+        own = arms.varies  # each state then has its own
+        if not own and (len(pattern) == 1 or bool((pattern == pattern[0]).all())):
             return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:], on_unstable)
         batch = held.shape[:-1]
         flat_D, flat_A = D.reshape(-1, *D.shape[-2:]), A.reshape(-1, *A.shape[-2:])
         parts: list[Tensor] = []
-        for unique in torch.unique(pattern, dim=0):
-            at = (pattern == unique).all(-1)
-            one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable
+        for k, unique in enumerate(pattern if own else torch.unique(pattern, dim=0)):
+            at = torch.arange(len(pattern)) == k if own else (pattern == unique).all(-1)
+            there = arms.one(k) if own else arms
+            one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable, there
             group = [torch.as_tensor(part) for part in self._solve(*one)]
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
@@ -139,7 +128,7 @@ class Reduction(nn.Module):
         held: Any,
         slack: Any,
         drives: Drives | None = None,
-        arms: Arms = _SAME,
+        arms: Arms = SAME,
     ) -> ReducedStep:
         """The equations in permitted coordinates z, scaled, of states in which the same joints are held.
 
@@ -167,10 +156,11 @@ class Reduction(nn.Module):
             F = K_B.mT @ eye[soft]
         batch = D.shape[:-2]
         arm = xp.sqrt((B[rigid] ** 2).sum(-1)).clip(1e-12)[:, None]
-        closed = (
-            [] if arms.closed is None else [_rows_of_one(like(torch.as_tensor(arms.closed), D)) @ S[:n_q]]
-        )
-        fixed = [part for part in (B[rigid] / arm, S[:n_q][held], *closed) if len(part)]
+        fixed = [B[rigid] / arm, S[:n_q][held]]
+        if arms.closed is not None:
+            rod = like(torch.as_tensor(arms.closed), D)
+            fixed.append(rod / norm(rod).clip(1e-12)[..., None] @ S[:n_q])
+        fixed = [part for part in fixed if len(part)]
         E = xp.concat([A, *(xp.broadcast_to(part, (*batch, *part.shape)) for part in fixed)], -2)
         R = xp.zeros((E.shape[-2], n_a), **kind)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
@@ -184,7 +174,7 @@ class Reduction(nn.Module):
         held: AnyArray,
         slack: AnyArray,
         on_unstable: str,
-        arms: Arms = _SAME,
+        arms: Arms = SAME,
     ) -> GraspResponse:
         system, n_h = self.reduced(D, A, rows, held, slack, arms=arms), len(rows)
         try:
@@ -235,11 +225,6 @@ class ReducedStep(NamedTuple):
             eye = xp.eye(n_a, **kind)
             dlam[..., soft, :] = self.stiffness[soft, None] * (_left(self.B[soft].mT, J) - eye[soft])
         return dlam
-
-
-def _rows_of_one(rows: AnyArray) -> Any:
-    """Rows divided by their norms, so that lengths and angles compare."""
-    return rows / norm(rows).clip(1e-12)[..., None]
 
 
 def _left(S: AnyArray, X: AnyArray) -> Any:
