@@ -89,3 +89,22 @@ def test_a_batch_is_its_states(motion: ContactMotion) -> None:
     for k in range(2):
         one = model.linearize(GraspState(away[k], state.position, state.rotation), contacts)
         torch.testing.assert_close(found[k], one.manipulation_jacobian, atol=1e-9, rtol=0)
+
+
+def test_figures_that_are_learned_are_factors_of_the_arms(motion: ContactMotion) -> None:
+    """J_m by each entry of J_a, the arms being functions of the posture."""
+    model = motion.model
+    lin = model.linearize(motion.state, model.contacts(motion.state))
+    assert lin.equations is not None
+    drives, still = model.reduction.drives, torch.zeros(model.hand.n_q, dtype=torch.float64)
+    way, rows = torch.linspace(0.01, 0.02, model.hand.n_a, dtype=torch.float64), list(range(lin.n_q + 6))
+    now = lin.equations.solve(still, drives)
+    torch.testing.assert_close(now.jacobian, lin.manipulation_jacobian, atol=1e-12, rtol=0)
+    slopes, h = now.derivative(way, rows).moment_arms, 1e-6
+    for i, j in drives.actuation.nonzero().tolist():
+        ends = []
+        for sign in (1, -1):
+            arms = drives.actuation.clone()
+            arms[i, j] += sign * h
+            ends.append(lin.equations.solve(still, drives._replace(actuation=arms)).jacobian @ way)
+        torch.testing.assert_close(slopes[:, i, j], (ends[0] - ends[1]) / (2 * h), atol=1e-6, rtol=1e-4)

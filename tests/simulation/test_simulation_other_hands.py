@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
@@ -26,6 +27,8 @@ def test_a_planned_pinch_holds_as_planned(kind: str, engine: str, tmp_path: Path
     plant = SimulatedHand(load_hand(write_hand(kind, tmp_path)), "can", engine=engine)
     seen = plant.reset(0)
     hand, truth = plant.hand, seen.truth
+    assert truth is not None
+    assert truth.fingertip_force is not None
     planned = np.linalg.norm(plant.plan.forces, axis=1)
     np.testing.assert_allclose(truth.fingertip_force, planned, rtol=KINDS[kind])
     np.testing.assert_allclose(truth.q, plant.plan.q, atol=0.05)
@@ -33,8 +36,10 @@ def test_a_planned_pinch_holds_as_planned(kind: str, engine: str, tmp_path: Path
     if hand.loops is not None:
         arms = np.linalg.norm(hand.loops.lengths.typical, axis=1)
         assert np.abs(hand.loops.gap(truth.q.numpy()) / arms).max() < 0.02
-    moved = plant.command(np.full(hand.n_a, 0.02))
-    assert abs(moved.truth.fingertip_force - truth.fingertip_force).max() > 0.05
+    moved = plant.command(torch.full((hand.n_a,), 0.02, dtype=torch.float64)).truth
+    assert moved is not None
+    assert moved.fingertip_force is not None
+    assert float((moved.fingertip_force - truth.fingertip_force).abs().max()) > 0.05
     plant.close()
 
 
