@@ -15,6 +15,7 @@ from ._toml import TODO
 from .branch import hand_below
 from .mjcf_hand import MjcfHand, read_mjcf
 from .registry import HAND_FILES
+from .transmission import unheld_of
 from .transmission_file import document, toml_key
 from .urdf import UrdfModel, read_urdf
 
@@ -103,7 +104,8 @@ def mjcf_template(mjcf: MjcfHand) -> str:
     """The text of the transmission file of an MJCF, with TODO for pads, and for what it needs and has not."""
     head = _MJCF_HEAD.format(mjcf=_comment(mjcf.urdf.path.name)).rstrip("\n")
     joints = mjcf.tables["joints"]
-    tables = mjcf.tables | {"joints": joints | {name: joints[name] | {"spring": TODO} for name in mjcf.loose}}
+    loose = {name: joints[name] | {"spring": TODO} for name in unheld_of(mjcf)}
+    tables = mjcf.tables | {"joints": joints | loose}
     lines = [head, "", document(tables).rstrip("\n")]
     if not mjcf.tables["actuators"]:
         lines += _actuators(mjcf.urdf)
