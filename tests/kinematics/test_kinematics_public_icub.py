@@ -109,4 +109,4 @@ def test_both_hands_move_alike_with_their_motors(tmp_path: Path) -> None:
     degrees = {name: np.degrees(theirs[name]) for name in theirs}
     expected = {"index_0": -10, "ring_0": 10, "little_0": 10, "thumb_2": 30, "index_3": 40, "ring_1": 30}
     for name, angle in expected.items():
-        assert degrees[name] == pytest.approx(angle, abs=1e-6), name
+        assert degrees[name] == pytest.approx(angle, abs=0.02), name  # springs stretch the drives a little
