@@ -260,6 +260,59 @@ def test_carrying_slides_are_held_and_things_left_out(tmp_path: Path) -> None:
     )
 
 
+# a four-bar on a carriage: its rod and a spring's tendon are the hand's, a rod on a ball joint is held
+HELD = """
+<mujoco model="held">
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="palm">
+      <joint name="rail" type="slide" axis="1 0 0" ref="0.05"/><geom size="0.01"/>
+      <body name="crank"><joint name="crank" axis="0 1 0" range="-1 1" stiffness="0.1"/><geom size="0.01"/>
+        <body name="rod" pos="0 0 0.03"><joint name="rod" axis="0 1 0" range="-1 1"/><geom size="0.01"/>
+        </body>
+        <body name="ball" pos="0 0 0.03"><joint name="ball" type="ball"/><geom size="0.01"/></body>
+      </body>
+      <body name="finger" pos="0.05 0 0">
+        <joint name="finger" axis="0 1 0" range="-1 1"/><geom size="0.01"/>
+        <body name="far"><joint name="far" axis="0 1 0" range="-1 1"/><geom size="0.01"/></body>
+      </body>
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="spring" stiffness="100" springlength="0.07">
+      <joint joint="crank" coef="0.01"/><joint joint="rail" coef="1"/>
+    </fixed>
+  </tendon>
+  <equality>
+    <connect name="four_bar" body1="rod" body2="finger" anchor="0.05 0 0"/>
+    <connect name="by_ball" body1="ball" body2="finger" anchor="0.05 0 0"/>
+    <connect name="carriage" body1="palm" body2="world" anchor="0 0 0"/>
+    <joint name="to_rail" joint1="far" joint2="rail" polycoef="0.2 1 3 0 0"/>
+  </equality>
+  <actuator><position name="pull" joint="crank" kp="5" ctrlrange="0 1"/></actuator>
+</mujoco>
+"""
+
+
+def test_loops_and_springs_of_a_hand_with_held_joints(tmp_path: Path) -> None:
+    """What is held stays where MuJoCo starts it, in loops, in couplings and in springs."""
+    hand = read(tmp_path, HELD)
+    assert hand.joint_names == ("crank", "rod", "finger", "far")
+    assert hand.loops is not None
+    assert hand.loops.names == ("four_bar", "four_bar")
+    np.testing.assert_array_equal(hand.coupling, [[0, 0, 0, 1]])
+    np.testing.assert_allclose(hand.spring_rest, [0, 0, 0, 0.2])
+    assert hand.tendon_springs is not None
+    np.testing.assert_allclose(hand.tendon_springs.low, [0.02])
+    assert hand.notes == (
+        "hands have hinges; joints of other kinds are held: rail, ball",
+        "loops that close through joints that are held are left out: by_ball",
+    )
+    template = write_template(tmp_path / "hand.xml").read_text()
+    assert 'spring = "TODO"' not in template  # the loop holds what has no spring
+    assert "slack = [0.0" in template
+
+
 def test_the_mass_that_a_file_sets_is_the_hands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With the things'; without MuJoCo's complaint in a file."""
     monkeypatch.chdir(tmp_path)

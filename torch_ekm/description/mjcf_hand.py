@@ -88,7 +88,9 @@ class _Conversion:
         if not self.hinges:
             raise DescriptionError(path, "; ".join(["there is no hinge joint", *self.notes]))
         names = {j: self.names[j] for j in self.hinges}
-        tables = MjcfTransmission(urdf, model, names, self.frames, self.whole, self._note).tables()
+        carried = {link for _, link in self.held}
+        reader = MjcfTransmission(urdf, model, names, self.frames, carried, self.whole, self._note)
+        tables = reader.tables()
         gravity = robot.pose(base)[:3, :3].T @ model.opt.gravity
         hand = {"name": name, "base_link": base, "gravity": (gravity + 0.0).tolist()}
         self._note_meshes(urdf)

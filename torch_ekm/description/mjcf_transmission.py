@@ -33,6 +33,7 @@ class MjcfTransmission:
         model: MuJoCo's.
         names: of MuJoCo's joints, by their numbers; those of the hand in the order of q.
         frames: of MuJoCo's bodies: the link of each, and its frame in the link's.
+        held: links that another joint than a hinge carries, which is held.
         whole: nothing of the file is left out.
         note: takes what is assumed, and of what.
     """
@@ -43,12 +44,13 @@ class MjcfTransmission:
         model: Any,
         names: dict[int, str],
         frames: dict[int, tuple[str, Array]],
+        held: set[str],
         whole: bool,
         note: Callable[[str, str], None],
     ) -> None:
         self.path, self.urdf, self.model, self.whole, self._note = urdf.path, urdf, model, whole, note
         self._mj = require("mujoco")
-        self.names, self.hinges, self._frames = names, list(names), frames
+        self.names, self.hinges, self._frames, self._held = names, list(names), frames, held
         limited = [bool(model.jnt_limited[j]) for j in self.hinges]
         ends = np.where(np.array(limited)[:, None], model.jnt_range[self.hinges], [-np.inf, np.inf])
         self.lower, self.upper = ends.T
@@ -283,16 +285,18 @@ class MjcfTransmission:
             link, frame = self._frames.get(body, ("", np.eye(4)))
             links.append(link)
             points.append((frame[:3, :3] @ point + frame[:3, 3]).tolist())
-        first, second = (
-            {joint.name for joint in self.urdf.joints_to(link) if joint.kind != "fixed"} for link in links
-        )
-        if first == second:
+        first, second = ({joint.child: joint.kind for joint in self.urdf.joints_to(link)} for link in links)
+        between = first.keys() ^ second.keys()
+        if all((first | second)[link] == "fixed" for link in between):
             return  # what carries the hand, or the rest of the robot
         if kind != self._mj.mjtEq.mjEQ_CONNECT:
             problem = f"equality '{name}' welds bodies: only joints, tendons and points are tied"
             raise DescriptionError(self.path, problem)
         if not set(links) <= {link.name for link in self.urdf.links}:
             self._note("points that are pinned to what is not of the hand are free", name)
+            return
+        if self._held & between:
+            self._note("loops that close through joints that are held are left out", name)
             return
         self._loops.append({"name": name, "links": links, "points": points})
 
