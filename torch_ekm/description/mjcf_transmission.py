@@ -228,7 +228,7 @@ class MjcfTransmission:
                 tie = self._tendon_name(t), row, (low + high) / 2 - offset
                 yield "tendons that can hardly move tie their joints", tie
             else:
-                self._note("tendons that only limit are left out", self._tendon_name(t))
+                self._note("limits of tendons are left out", self._tendon_name(t))
 
     # -- equalities ---------------------------------------------------------------------------------
 
