@@ -34,7 +34,8 @@ def test_the_hand_of_the_tutorial_loads_and_moves(tmp_path: Path, monkeypatch: p
     assert hand.base_link == "hand"
     assert [shape.kind for shape in hand.urdf.link("left_far").collisions] == ["cylinder", "sphere"]
     q = ActuationMap(hand).joints(torch.tensor([1.14, 0.57], dtype=torch.float64))
-    left = torch.tensor([0.5, 0.8], dtype=torch.float64)  # 0.2 q_0 = t, 0.1 q_1 = 0.8 t, q_0 + 0.8 q_1 = a
+    # 0.2 q_0 = t, 0.1 q_1 = 0.8 t, q_0 + 0.8 q_1 = a - t / 10
+    left = torch.tensor([1.0, 1.6], dtype=torch.float64) * 1.14 / 2.3
     torch.testing.assert_close(q, torch.cat([left, 0.5 * left]))
     base = torch.tensor([-0.03, 0.0, 0.0], dtype=torch.float64)
     along = torch.tensor([torch.sin(q[0]), torch.cos(q[0]), 0.0], dtype=torch.float64)  # closes towards +x

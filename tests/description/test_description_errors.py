@@ -46,8 +46,7 @@ URDF_FAULTS = {
     "word": ('lower="-0.5"', 'lower="low"', "finite number, got 'low'"),
     "two numbers": ('xyz="-0.03 0 0"', 'xyz="-0.03 0"', "must be three numbers, got '-0.03 0'"),
     "no limit": ("<limit ", "<bounds ", "joint 'left_0': <joint> needs a <limit>"),
-    "type": ('type="revolute"', 'type="prismatic"', "type 'prismatic' is not supported; supported: revolute"),
-    "mimic": ('<axis xyz="0 0 -1"/>', '<mimic joint="right_0"/>', "mimic.*couplings"),
+    "type": ('type="revolute"', 'type="screw"', "type 'screw' is not supported; supported: revolute"),
     "commas": ('xyz="-0.03 0 0"', 'xyz="-0.03,0,0"', "'xyz' must be three numbers, got '-0.03,0,0'"),
     "no axis": ('<axis xyz="0 0 -1"/>', "<axis/>", "axis: <axis> needs the attribute 'xyz'"),
     "no inertia": ('ixx="', 'mxx="', "link 'hand', inertial, inertia: .* the attribute 'ixx'"),
@@ -59,7 +58,7 @@ URDF_FAULTS = {
     "mass": (
         'mass value="0.1"',
         'mass value="-0.1"',
-        "link 'hand': mass and principal inertias must be positive",
+        "link 'hand': the mass must not be negative",
     ),
     "size": ('<cylinder radius="0.006"', '<cylinder radius="0"', "size of a cylinder must be positive"),
     "unknown parent": (
@@ -111,7 +110,7 @@ TRANSMISSION_FAULTS = {
     "pad link": ('link = "left_1"', 'link = "left_9"', "unknown link 'left_9'; the URDF's links are: hand"),
     "pad radius": ("radius = 0.006", "radius = 0.0", "'radius' must be positive"),
     "pad twice": ('name = "right"\nlink', 'name = "left"\nlink', "each pad must be unique, repeated: left"),
-    "base": ('base_link = "hand"', 'base_link = "left_1"', "moves with joint 'left_1'"),
+    "base": ('base_link = "hand"', 'base_link = "left_1"', "'left_1' carries no revolute"),
     "no pinch": (
         'base_link = "hand"',
         'base_link = "hand"\npinch_force = 0',

@@ -69,11 +69,55 @@ def test_a_mimic_becomes_a_coupling(tmp_path: Path) -> None:
     written.write_text(
         good.replace("middle = -0.5", "middle = -0.4").replace("knuckle = -0.5", "knuckle = -0.4")
     )
-    with pytest.raises(DescriptionError, match=r"'middle' is a <mimic> of 'knuckle'.*knuckle = -0\.5"):
+    assert hand.notes == ()
+
+
+def test_a_transmission_file_overrules_a_mimic(tmp_path: Path) -> None:
+    """By another coupling, by none, or by another angle at rest; each time with a note."""
+    urdf = tmp_path / "mine.urdf"
+    urdf.write_text(MIMIC)
+    written = write_template(urdf)
+    good = filled_in(written)
+    written.write_text(good.replace("knuckle = -0.5", "knuckle = -0.4"))
+    hand = load_hand(urdf)
+    assert hand.coupling.tolist() == [[-0.4, 1.0]]
+    (note,) = hand.notes
+    assert "'middle' is a <mimic> of 'knuckle'" in note
+    assert "knuckle = -0.5" in note
+    start, end = good.index("[[couplings]]"), good.index("[[actuators]]")
+    alone = good[:start] + good[end:]
+    written.write_text(alone)
+    with pytest.raises(DescriptionError, match="holds the joints middle"):
         load_hand(urdf)
+    written.write_text(alone.replace("spring = 0.0", "spring = 0.1"))
+    assert len(load_hand(urdf).coupling) == 0
     written.write_text(good.replace("rest_deg = 14.3", "rest_deg = 34.3"))
-    with pytest.raises(DescriptionError, match=r"rests at 0\.25 rad"):
-        load_hand(urdf)
+    assert "an offset of 11.4592 deg" in load_hand(urdf).notes[0]
+
+
+@pytest.mark.parametrize(
+    ("mimic", "locked", "note"),
+    [
+        ('joint="knuckle" multiplier="0" offset="0.2"', True, ""),
+        ('joint="slide" multiplier="2" offset="0.2"', True, "does not move is locked: middle"),
+        ('joint="gone"', False, "of no other joint is left out: middle"),
+    ],
+)
+def test_a_mimic_of_what_does_not_move(mimic: str, locked: bool, note: str, tmp_path: Path) -> None:
+    urdf = tmp_path / "mine.urdf"
+    slide = (
+        '<link name="x"/><joint name="slide" type="prismatic"><parent link="base"/><child link="x"/></joint>'
+    )
+    text = MIMIC.replace('joint="knuckle" multiplier="0.5" offset="0.2"', mimic)
+    urdf.write_text(text.replace("</robot>", slide + "</robot>"))
+    written = write_template(urdf)
+    written.write_text(filled_in(written))
+    hand = load_hand(urdf)
+    assert note in " ".join(hand.notes)
+    assert "held at 0: slide" in " ".join(hand.notes)
+    assert hand.coupling.tolist() == ([[0.0, 1.0]] if locked else [])
+    if locked:
+        assert hand.spring_rest[1] == pytest.approx(0.2)
 
 
 def test_the_pad_of_a_thumb_is_called_so(tmp_path: Path) -> None:
@@ -90,6 +134,3 @@ def test_what_no_template_is_written_for(tmp_path: Path) -> None:
     (tmp_path / "thing.urdf").write_text('<robot name="thing"><link name="thing"/></robot>')
     with pytest.raises(DescriptionError, match="no revolute or continuous joint"):
         write_template(tmp_path / "thing.urdf")
-    (tmp_path / "m.urdf").write_text(MIMIC.replace('joint="knuckle"', 'joint="thumb"'))
-    with pytest.raises(DescriptionError, match="names 'thumb', which must be one of knuckle"):
-        write_template(tmp_path / "m.urdf")

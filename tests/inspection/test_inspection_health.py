@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import sys
@@ -19,13 +20,17 @@ from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog
 
 DEG = math.pi / 180
 HAND = load_hand("yale_t42")
+DRIVES = tuple(dataclasses.replace(one, stiffness=math.inf, tendon=False) for one in HAND.actuators)
 
 
 class Made:
     """Motions of a T42: what tendons pass on, how far joints go by themselves, and dead zones, as set."""
 
     def __init__(self, seed: int) -> None:
-        self.draw, self.map = np.random.default_rng(seed), ActuationMap(HAND)
+        self.draw, self.map = (
+            np.random.default_rng(seed),
+            ActuationMap(dataclasses.replace(HAND, actuators=DRIVES)),
+        )
         self.gain, self.dead = np.array([0.6, 0.7]), np.array([1.0, 1.0]) * DEG
         self.a = np.array([0.9, 0.8])
         self.x = self.a.copy()

@@ -1,49 +1,78 @@
-"""The actuation map: virtual work, couplings, the free-motion inverse."""
+"""The actuation map: virtual work, couplings, where a free hand rests."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 
-from torch_ekm.description import load_hand
+from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import ShapeError
 from torch_ekm.kinematics import ActuationMap
+from torch_ekm.kinematics.null_space import null_space
 
 HANDS = ("icub_right", "icub_left", "planar_two_finger")
 
 
+def rigid(name: str) -> HandDescription:
+    """A hand whose drives have no compliance and pull both ways."""
+    hand = load_hand(name)
+    actuators = (dataclasses.replace(one, stiffness=math.inf, tendon=False) for one in hand.actuators)
+    free = np.full(hand.n_q, np.inf)
+    return dataclasses.replace(hand, actuators=tuple(actuators), joint_lower=-free, joint_upper=free)
+
+
 @pytest.mark.parametrize("name", HANDS)
 @pytest.mark.parametrize("shape", [(), (1,), (5,), (2, 3)])
-def test_joints_invert_actuators(name: str, shape: tuple[int, ...]) -> None:
-    hand = load_hand(name)
+def test_joints_invert_actuators_of_rigid_drives(name: str, shape: tuple[int, ...]) -> None:
+    """Affine: the least spring energy of all postures with these actuator positions."""
+    hand = rigid(name)
     actuation = ActuationMap(hand)
     a = torch.rand(*shape, hand.n_a, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
     q = actuation.joints(a)
     assert q.shape == (*shape, hand.n_q)
     torch.testing.assert_close(actuation.actuators(q), a, atol=1e-12, rtol=0)
-    slip = actuation.C @ (q - torch.from_numpy(hand.spring_rest))[..., None]
+    slip = torch.from_numpy(hand.coupling) @ (q - torch.from_numpy(hand.spring_rest))[..., None]
     torch.testing.assert_close(slip, torch.zeros_like(slip), atol=1e-12, rtol=0)
+    rows = np.vstack([hand.actuation_jacobian, hand.coupling])
+    N, K = null_space(rows), np.diag(hand.spring_stiffness)
+    P = np.linalg.pinv(rows)[:, : hand.n_a]
+    P = P - N @ np.linalg.solve(N.T @ K @ N, N.T @ K @ P) if N.size else P
+    excess = (a - actuation.actuators(torch.from_numpy(hand.spring_rest))).numpy()
+    torch.testing.assert_close(q, torch.from_numpy(hand.spring_rest + excess @ P.T), atol=1e-12, rtol=0)
+    torch.testing.assert_close(
+        actuation.free_motion(a)[..., :, :], torch.from_numpy(P).expand(*shape, -1, -1)
+    )
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_free_motion_is_an_equilibrium_of_the_springs(name: str) -> None:
-    """Virtual work: ``K_s (q - q0)`` does none along motions that actuators and couplings leave free."""
+def test_free_motion_is_an_equilibrium(name: str) -> None:
+    """``K_s (q - q0) = J^T k (a - l)`` along what couplings and stops leave free."""
     hand = load_hand(name)
     actuation = ActuationMap(hand)
-    a = torch.linspace(0.1, 1.0, hand.n_a, dtype=torch.float64)
+    a = torch.from_numpy(0.6 * hand.actuator_lower + 0.4 * hand.actuator_upper).requires_grad_()
     q = actuation.joints(a)
-    torque = torch.from_numpy(hand.spring_stiffness) * (q - torch.from_numpy(hand.spring_rest))
-    assert float(torque.abs().max()) > 0.01
-    assert float((actuation.null.mT @ torque).abs().max()) < 1e-12
-    for rows in (actuation.J_a, actuation.C):
-        assert float((rows @ actuation.null).abs().sum()) < 1e-11
+    stretch = (a - actuation.actuators(q)).detach().numpy()
+    k = np.array([one.stiffness for one in hand.actuators])
+    torque = hand.spring_stiffness * (q.detach().numpy() - hand.spring_rest)
+    assert np.abs(torque).max() > 0.01
+    q_now = q.detach().numpy()
+    stopped = (q_now <= hand.joint_lower + 1e-9) | (q_now >= hand.joint_upper - 1e-9)
+    N = null_space(np.vstack([hand.coupling, np.eye(hand.n_q)[stopped]]))
+    assert np.abs(N.T @ (torque - (k * stretch) @ hand.actuation_jacobian)).max() < 1e-10
+    eye = 1e-6 * torch.eye(hand.n_a, dtype=torch.float64)
+    change = (actuation.joints(a + eye) - actuation.joints(a - eye)).detach().T / 2e-6
+    torch.testing.assert_close(actuation.free_motion(a), change, atol=1e-8, rtol=0)
+    (slope,) = torch.autograd.grad(q.sum(), a)
+    torch.testing.assert_close(slope, change.sum(0), atol=1e-8, rtol=0)
 
 
 def test_icub_splits_evenly() -> None:
     """a/2 per distal joint, a/3 per ring or little joint, (60 deg - a)/3 per abduction: iKin's split."""
-    hand = load_hand("icub_right")
+    hand = rigid("icub_right")
     actuation = ActuationMap(hand)
     a_deg = {
         "hand_finger": 33.0,
@@ -70,14 +99,9 @@ def test_icub_splits_evenly() -> None:
         assert q[joint] == pytest.approx(angle, abs=1e-9), joint
 
 
-def test_icub_counts() -> None:
-    """9 actuators + 4 couplings leave 7 of 20 joints to springs and contacts."""
+def test_icub_hand_finger() -> None:
+    """hand_finger: 60 deg together, 0 deg spread by 20 deg each."""
     actuation = ActuationMap(load_hand("icub_right"))
-    assert actuation.J_a.shape == (9, 20)
-    assert actuation.C.shape == (4, 20)
-    assert actuation.null.shape == (20, 7)
-    assert torch.linalg.matrix_rank(torch.cat([actuation.J_a, actuation.C])) == 13
-    # hand_finger: 60 deg together, 0 deg spread by 20 deg each
     q = torch.zeros(20, dtype=torch.float64)
     assert math.degrees(float(actuation.actuators(q)[0])) == pytest.approx(60.0)
     q[[4, 12, 16]] = math.radians(20)
@@ -86,7 +110,7 @@ def test_icub_counts() -> None:
 
 def test_planar_by_hand() -> None:
     """Springs 0.2 and 0.1, arms 1 and 0.8: ``q = a K^-1 J^T/(J K^-1 J^T) = a (5, 8)/11.4``."""
-    actuation = ActuationMap(load_hand("planar_two_finger"), dtype=torch.float32)
+    actuation = ActuationMap(rigid("planar_two_finger"), dtype=torch.float32)
     q = actuation.joints(torch.tensor([1.14, 0.57]))
     torch.testing.assert_close(q, torch.tensor([0.5, 0.8, 0.25, 0.4]))
 
@@ -97,4 +121,4 @@ def test_errors() -> None:
         actuation.joints(torch.zeros(3, dtype=torch.float64))
     with pytest.raises(ShapeError, match="left_0, left_1"):
         actuation.actuators(torch.zeros(2, dtype=torch.float64))
-    assert "free=2" in repr(actuation)
+    assert "joints=4" in repr(actuation)

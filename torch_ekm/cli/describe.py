@@ -20,8 +20,11 @@ def hands(
         Path | None,
         Option(
             metavar="FILE",
-            help="Write NAME.transmission.toml next to this NAME.urdf or NAME.xml (MJCF), to be filled in.",
+            help="Write NAME.transmission.toml next to this URDF or MJCF (.xml, .mjcf), to be filled in.",
         ),
+    ] = None,
+    base: Annotated[
+        str | None, Option(metavar="LINK", help="With --new, of a robot: the hand is what this link carries.")
     ] = None,
 ) -> None:
     """List the hands of the package, or begin your own.
@@ -32,9 +35,13 @@ def hands(
     A file that is there is not overwritten.
     """
     from ..description import list_hands, load_hand, write_template
+    from ..description.template import ASSUMED
 
     if new is not None:
-        written = write_template(new)
+        written = write_template(new, base)
+        for line in written.read_text(encoding="utf-8").splitlines():
+            if line.startswith(ASSUMED):
+                say(f"Assumed:   {line.removeprefix(ASSUMED)}")
         say(f"Written:   {written.resolve()}")
         say(f"Next:      put a figure wherever TODO stands, then: torch-ekm check {new}")
         return

@@ -121,7 +121,7 @@ def health(
                 motions.append(len(trial.commands))
                 yield k, trial
 
-    found = hand_health(load_hand(name), trials())
+    found = hand_health(load_hand(name).counted(), trials())
     if found:
         print_table(HealthChange._fields, found, str(name))
     if knowledge is not None:

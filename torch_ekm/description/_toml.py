@@ -18,6 +18,8 @@ _LARGEST_FILE = 64 * 1024  # bytes
 _LONGEST_LINE = 4096  # characters: a dotted key stands on one line, and tomllib takes its square in time
 _DEEPEST = 8  # tables and lists in each other
 LARGEST_FIGURE = 1e9
+#: Stands for a figure that is still to be filled in.
+TODO = "TODO"
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

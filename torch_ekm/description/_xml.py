@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
 
 from .._text import read_text
 from ..exceptions import DescriptionError
 
+_MOST_NAMES = 6  # of a note
 LARGEST = 4 << 20  # bytes of a file that describes a hand or an object
 
 
@@ -25,3 +27,9 @@ def read_xml(path: Path, what: str, *roots: str) -> ET.Element:
     if root.tag not in roots:
         raise DescriptionError(path, f"the root element must be <{roots[0]}>, found <{root.tag}>")
     return root
+
+
+def listed(note: str, names: Sequence[str]) -> str:
+    """A note on several things: ``"note: a, b"``, and how many more there are."""
+    more = len(names) - _MOST_NAMES
+    return f"{note}: {', '.join(names[:_MOST_NAMES])}" + (f" and {more} more" if more > 0 else "")

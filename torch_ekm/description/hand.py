@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..exceptions import DescriptionError
 from ..typing import Array
+from .lengths import Lengths, Loops, TendonSprings
 from .urdf import UrdfModel
+
+_ANGLES = (0.1, 10.0)  # a largest moment arm of a motor between these is a ratio of angles
 
 
 @dataclass(frozen=True)
 class Actuator:
     """One motor, as its position controller shows it.
 
-    ``a = offset + J_a[row] q``, and ``lower <= a <= upper``, all [rad].
+    ``a = offset + l(q)``, with constant moment arms ``J_a[row] q``, and ``lower <= a <= upper``, all [rad].
     """
 
     name: str
@@ -31,6 +34,8 @@ class Actuator:
     backlash: float = 0.0
     """Play of the drive, from one end to the other [rad]: a reversal of the motor smaller than that moves
     nothing (:class:`~torch_ekm.kinematics.Play`)."""
+    unit: float = 1.0
+    """What 1 is in the units of the files; see :meth:`HandDescription.counted`."""
     posture: bool = False
     """True: it shapes the hand before a grasp; a controller leaves it alone while something is held."""
 
@@ -87,7 +92,7 @@ class HandDescription:
     joint_upper: Array
     actuators: tuple[Actuator, ...]
     actuation_jacobian: Array
-    """J_a = da/dq, ``(n_a, n_q)``, constant moment arms."""
+    """J_a = da/dq, ``(n_a, n_q)``: constant moment arms, and typical ones of arms that are functions."""
     coupling: Array
     """C with ``C dq = 0``, ``(n_k, n_q)``: rigid couplings and locked joints; ``C q = C q0`` at all times."""
     spring_stiffness: Array
@@ -108,6 +113,12 @@ class HandDescription:
 
     notes: tuple[str, ...] = ()
     """What an MJCF says that is left out or approximated here."""
+    arm_functions: Lengths | None = None
+    """How moment arms change with the posture, as factors of ``actuation_jacobian``; None: they do not."""
+    tendon_springs: TendonSprings | None = None
+    """Springs over tendons."""
+    loops: Loops | None = None
+    """What closes chains, and joints that follow others along a curve."""
 
     def __post_init__(self) -> None:
         if self.planar_normal is not None:
@@ -128,6 +139,43 @@ class HandDescription:
                 problem = f"the axis of joint '{joint.name}' is {degrees:.3g} deg off planar_normal"
                 problem += "; a planar hand turns about it alone"
                 raise DescriptionError(self.transmission_path, problem)
+
+    @property
+    def lengths(self) -> Lengths:
+        """``a = offset + l(q)``, with the arms of ``actuation_jacobian``."""
+        return self.arm_functions or Lengths(self.actuation_jacobian)
+
+    def counted(self) -> HandDescription:
+        """The same hand with each motor in a unit of its own, as plants, models and controllers count.
+
+        A motor whose largest moment arm is below 0.1 or above 10 counts in lengths of its tendon, or in turns
+        before a gear: 1 is then the largest arm of it, so that its position is an angle. Others stay in rad.
+        """
+        largest = np.abs(self.actuation_jacobian).max(axis=1)
+        unit = np.where((largest < _ANGLES[0]) | (largest > _ANGLES[1]), largest, 1.0)
+        if (unit == 1.0).all():
+            return self
+        actuators = [
+            replace(
+                one,
+                **{name: getattr(one, name) / u for name in ("lower", "upper", "offset", "backlash")},
+                stiffness=one.stiffness * u**2,
+                unit=one.unit * u,
+            )
+            for one, u in zip(self.actuators, unit.tolist(), strict=True)
+        ]
+        J_a = self.actuation_jacobian / unit[:, None]
+        return replace(self, actuators=tuple(actuators), actuation_jacobian=J_a)
+
+    def unloaded(self, q: Array) -> Array:
+        """``offset + l(q)``: where the motors are whose transmissions are not stretched ``(*batch, n_a)``."""
+        return self.actuator_offset + self.lengths.length(q, self.actuation_jacobian)
+
+    def bent(self, q: Array) -> Array:
+        """``l(q) - J_a q``: what typical moment arms do not say of the lengths ``(*batch, n_a)``."""
+        if self.lengths.constant:
+            return np.zeros((*q.shape[:-1], self.n_a))
+        return self.lengths.length(q, self.actuation_jacobian) - q @ self.actuation_jacobian.T
 
     @property
     def urdf_path(self) -> Path:

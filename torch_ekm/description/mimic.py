@@ -1,20 +1,21 @@
-"""``<mimic>`` of a URDF: joints that are tied to others, as the couplings of a transmission file say."""
+"""Joints that are tied to others, by a URDF's ``<mimic>`` or by couplings, and joints that nothing holds."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..exceptions import DescriptionError
 from ..typing import Array
+from ._xml import listed
 
 _CLOSE = 1e-6  # of weights
 _RESTS = 1e-3  # [rad]: an angle written with few digits
+_LOOSE = 1e-9  # stiffness of a motion against the hand's stiffest, or 1 N m/rad
+_PART = 1e-6  # of a joint in a motion
 
 
 @dataclass(frozen=True)
@@ -27,54 +28,72 @@ class Mimic:
     offset: float
 
     def coupling(self) -> dict[str, float]:
-        """Weights of the rigid coupling that says the same of increments."""
-        return {self.joint: 1.0, self.other: -self.multiplier}
+        """Weights of the rigid coupling that says the same of increments; multiplier 0: a locked joint."""
+        other = {self.other: -self.multiplier} if self.multiplier else {}
+        return {self.joint: 1.0, **other}
 
 
-def read_mimics(path: Path, joints: Sequence[Any]) -> tuple[Mimic, ...]:
-    """The ``<mimic>`` of all moving joints, of the ``yourdfpy.Joint`` of a file.
+def read_mimics(joints: Sequence[Any]) -> tuple[tuple[Mimic, ...], list[str]]:
+    """The ``<mimic>`` of all moving joints, of the ``yourdfpy.Joint`` of a file, and notes.
 
-    Raises:
-        DescriptionError: one names no other moving joint, or has the multiplier 0.
+    One that names a joint that does not move locks its joint (multiplier 0); one that names none is left out.
     """
     moving = [joint.name for joint in joints if joint.type != "fixed"]
-    found = []
+    still = [joint.name for joint in joints if joint.type == "fixed"]
+    found, odd, locked = [], [], []
     for joint in joints:
         if joint.mimic is None:
             continue
-        place, other = f"joint '{joint.name}': <mimic>", joint.mimic.joint
-        if other not in moving or other == joint.name:
-            valid = ", ".join(one for one in moving if one != joint.name)
-            raise DescriptionError(path, f"{place} names '{other}', which must be one of {valid}")
-        if joint.mimic.multiplier == 0:
-            raise DescriptionError(path, f"{place}: 'multiplier' is 0; make it a fixed joint")
-        found.append(Mimic(joint.name, other, joint.mimic.multiplier, joint.mimic.offset))
-    return tuple(found)
+        other, multiplier = joint.mimic.joint, joint.mimic.multiplier
+        if other == joint.name or other not in (*moving, *still):
+            odd.append(f"{joint.name} (of {other})")
+            continue
+        if other in still:
+            locked.append(f"{joint.name} (of {other})")
+            multiplier = 0.0
+        found.append(Mimic(joint.name, other, multiplier, joint.mimic.offset))
+    notes = [listed("each <mimic> of no other joint is left out", odd)] if odd else []
+    notes += [listed("each <mimic> of a joint that does not move is locked", locked)] if locked else []
+    return tuple(found), notes
 
 
-def check_mimics(
-    path: Path, urdf: Path, mimics: Sequence[Mimic], names: Sequence[str], C: Array, rest: Array
-) -> None:
-    """Each ``<mimic>`` must follow from the couplings ``C q = C q0``.
+def overruled(mimics: Sequence[Mimic], names: Sequence[str], C: Array, rest: Array) -> list[str]:
+    """A note for each ``<mimic>`` that does not follow from the couplings ``C q = C q0``, which hold.
 
     Args:
-        path, urdf: of the transmission file and of the URDF.
+        names: of the joints, ``n_q``.
         C: ``(n_k, n_q)``.
         rest: q0, ``(n_q,)`` [rad].
-
-    Raises:
-        DescriptionError: a coupling is missing, or the rest angles contradict the offset.
     """
+    notes = []
     for mimic in mimics:
         row = np.zeros(len(names))
         for name, weight in mimic.coupling().items():
             row[list(names).index(name)] = weight
         apart = row @ np.linalg.pinv(C) @ C - row if C.size else row
+        said = f"'{mimic.joint}' is a <mimic> of '{mimic.other}'"
         if np.abs(apart).max() > _CLOSE * np.abs(row).max():
             weights = ", ".join(f"{name} = {weight:g}" for name, weight in mimic.coupling().items())
-            problem = f"'{mimic.joint}' is a <mimic> of '{mimic.other}' in {urdf}: add [[couplings]] with"
-            raise DescriptionError(path, f"{problem} joints = {{ {weights} }}")
-        if abs(row @ rest - mimic.offset) > _RESTS:
-            wanted = mimic.multiplier * rest[list(names).index(mimic.other)] + mimic.offset
-            problem = f"[joints] {mimic.joint}: as a <mimic> of '{mimic.other}' in {urdf} it rests at"
-            raise DescriptionError(path, f"{problem} {wanted:.6g} rad ({math.degrees(wanted):.6g} deg)")
+            notes.append(f"{said}, and is not tied so: no [[couplings]] with joints = {{ {weights} }}")
+        elif abs(row @ rest - mimic.offset) > _RESTS:
+            offset = f"an offset of {math.degrees(mimic.offset):.6g} deg"
+            notes.append(f"{said} with {offset}; the 'rest' of [joints] says another, which holds")
+    return notes
+
+
+def unheld_joints(names: Sequence[str], rows: Array, stiffness: Array) -> list[str]:
+    """The joints that have a part in a motion v which no spring, actuator or coupling holds.
+
+    ``B v = 0``, ``v^T K v = 0``.
+
+    Args:
+        names: of the joints, ``n_q``.
+        rows: B, moment arms and couplings, ``(n, n_q)``.
+        stiffness: K, of the springs, ``(n_q, n_q)`` [N m/rad].
+    """
+    _, singular, V = np.linalg.svd(rows)
+    N = V[int((singular > 1e-9 * singular.max(initial=0.0)).sum()) :].T
+    stiff, modes = np.linalg.eigh(N.T @ stiffness @ N)
+    free = N @ modes[:, stiff <= _LOOSE * stiff.max(initial=1.0)]
+    part = np.linalg.norm(free, axis=1)
+    return [name for name, one in zip(names, part, strict=True) if one > _PART]

@@ -13,7 +13,7 @@ from typing import Any
 
 from .._extras import require
 from ..exceptions import DescriptionError
-from ._xml import read_xml
+from ._xml import listed, read_xml
 
 _MOST_ELEMENTS = 20_000  # of all files together
 _MOST_FILES = 50
@@ -22,31 +22,44 @@ _NOT_READ = {  # of elements that are
     "camera", "light", "plugin", "flag", "material", "texture", "hfield", "skin", "flexcomp", "numeric",
 }  # fmt: skip
 _BUILDS = {"attach", "composite", "replicate"}  # bodies that do not stand in the file
-_ATTRIBUTES = {"compiler": ("meshdir", "texturedir", "assetdir", "coordinate"), "": ("material", "user")}
+_BOUNDS = {"boundmass": "1e-6", "boundinertia": "1e-12", "balanceinertia": "true"}  # least, kg and kg m^2
+_ATTRIBUTES = ("material", "user")  # that are not read, ...
+_SETTINGS = {  # ... and of elements that only set something, all that is
+    "option": {"gravity"},
+    "default": {"class"},
+    "compiler": {"angle", "autolimits", "eulerseq", "inertiafromgeom", "inertiagrouprange"} | _BOUNDS.keys(),
+}
+_MESHES = ("mesh", "hfield", "sdf")  # types of a geom
 
 
-def compile_mjcf(path: Path) -> tuple[Any, set[str]]:
-    """MuJoCo's model, and the names of the bodies that have meshes.
+def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
+    """MuJoCo's model, the names of the bodies that have meshes, and notes.
 
     A body without a mass of its own gets 1 mg: it may have stood in a mesh.
 
     Raises:
-        DescriptionError: a file is missing, too large, malformed, outside the folder or includes itself, or
-            MuJoCo refuses what it says.
+        DescriptionError: a file is missing, too large, malformed or includes itself, or MuJoCo refuses what
+            it says.
         MissingExtraError: mujoco is not installed.
     """
-    root = _read(path)[0]
+    reader = _read(path)
+    root = reader.root
     strict = ET.Element("mujoco", model=root.get("model", path.stem))
-    ET.SubElement(strict, "compiler", boundmass="1e-6", boundinertia="1e-12", balanceinertia="true")
+    ET.SubElement(strict, "compiler", _BOUNDS)
     for element in root:
         if element.tag in _READ:
             strict.append(element)
-    meshes: set[str] = set()
+    notes = [listed("files outside the folder are not read", reader.left_out)] if reader.left_out else []
+    meshes, total = _take_out_meshes(strict), "-1"
     for element in strict.iter():
-        _strip(path, element, meshes)
+        total = element.get("settotalmass", total)
+        _strip(path, element)
     mujoco = require("mujoco")
     try:
-        return mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode")), meshes
+        model = mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode"))
+        if float(total) > 0:  # MuJoCo complains of the attribute
+            mujoco.mj_setTotalmass(model, float(total))
+        return model, meshes, notes
     except RecursionError:
         raise DescriptionError(path, "elements are nested too deep") from None
     except (ValueError, RuntimeError) as error:
@@ -59,14 +72,15 @@ def mjcf_files(path: Path) -> list[Path]:
     Raises:
         DescriptionError: as :func:`compile_mjcf`, of the files alone.
     """
-    return _read(path)[1]
+    return _read(path).files
 
 
-def _read(path: Path) -> tuple[ET.Element, list[Path]]:
-    """The root element, includes in their places, and the files that were read."""
+def _read(path: Path) -> _Reader:
+    """All files, each in the place of its ``<include>``."""
     reader = _Reader(path)
     try:
-        return reader.read(path, ()), reader.files
+        reader.root = reader.read(path, ())
+        return reader
     except RecursionError:
         raise DescriptionError(path, "elements are nested too deep") from None
 
@@ -82,11 +96,14 @@ class _Reader:
         self.folder = _real(path).parent
         self.elements = 0
         self.files: list[Path] = []
+        self.left_out: list[str] = []
+        self.root = ET.Element("mujoco")
 
     def read(self, path: Path, above: tuple[Path, ...]) -> ET.Element:
         real = _real(path)
-        if not real.is_relative_to(self.folder):
-            raise DescriptionError(above[-1], f"<include> of '{path}', which is outside {self.folder}")
+        if not real.is_relative_to(self.folder):  # a file may be a stranger's
+            self.left_out.append(os.path.relpath(path, self.folder))
+            return ET.Element("mujocoinclude")
         if real in above:
             raise DescriptionError(above[-1], f"<include> of '{path.name}', which includes this file")
         self.files.append(path)
@@ -110,17 +127,57 @@ class _Reader:
             element[place : place + 1] = list(self.read(self.folder / file, above))
 
 
-def _strip(path: Path, element: ET.Element, meshes: set[str]) -> None:
+def _take_out_meshes(root: ET.Element) -> set[str]:
+    """Take out the geoms that are meshes, by themselves or by their class; the bodies that had any.
+
+    A geom's class is its own, or the ``childclass`` of the nearest body that has one.
+    """
+    classes, bodies = _mesh_classes(root), set()
+    inside = [(element, "", "") for element in root if element.tag != "default"]
+    for element, named, body in inside:
+        named = element.get("childclass", named)
+        body = element.get("name", "") if element.tag == "body" else body
+        for child in list(element):
+            has, needs = classes.get(child.get("class", named), (False, False))
+            needs = child.get("type") in _MESHES if "type" in child.attrib else needs
+            if child.tag != "geom":
+                inside.append((child, named, body))
+            elif has or needs or "mesh" in child.attrib:
+                bodies.add(body)
+                element.remove(child)
+    return bodies
+
+
+def _mesh_classes(root: ET.Element) -> dict[str, tuple[bool, bool]]:
+    """Of each default class: whether its geoms have a mesh, and whether they are of a type that needs one.
+
+    Both leave the defaults, so that MuJoCo looks for no mesh.
+    """
+    classes = {"": (False, False)}
+    inside = [(default, "") for default in root.findall("default")]
+    for default, above in inside:
+        name = default.get("class", "")
+        name = "" if name == "main" else name
+        has, needs = classes.get(name, classes[above])
+        for geom in default.findall("geom"):
+            has = geom.attrib.pop("mesh", None) is not None or has
+            needs = geom.get("type") in _MESHES if "type" in geom.attrib else needs
+            if geom.get("type") in _MESHES:
+                del geom.attrib["type"]
+        classes[name] = has, needs
+        inside += [(child, name) for child in default.findall("default")]
+    return {**classes, "main": classes[""]}
+
+
+def _strip(path: Path, element: ET.Element) -> None:
     """Take out what is not read."""
-    for name in (*_ATTRIBUTES.get(element.tag, ()), *_ATTRIBUTES[""]):
-        element.attrib.pop(name, None)
+    settings = _SETTINGS.get(element.tag, set(element.attrib).difference(_ATTRIBUTES))
+    for name in set(element.attrib) - settings:
+        del element.attrib[name]
     for child in list(element):
         if child.tag in _BUILDS:
             raise DescriptionError(path, f"<{child.tag}> is not supported: write out what it makes")
-        mesh = child.tag == "geom" and (child.get("mesh") or child.get("type") in ("mesh", "hfield", "sdf"))
-        if mesh and element.tag == "body":
-            meshes.add(element.get("name", ""))
-        if child.tag in _NOT_READ or (mesh and element.tag != "default"):
+        if child.tag in _NOT_READ:
             element.remove(child)
         elif "file" in child.attrib:
             raise DescriptionError(path, f"<{child.tag} file=...>: only <include> may name a file")

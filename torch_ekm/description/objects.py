@@ -66,6 +66,8 @@ def read_object(path: Path, urdf: UrdfModel) -> ObjectDescription:
     body = urdf.links[0]
     if body.mass <= 0:
         raise DescriptionError(urdf.path, f"link '{body.name}' needs an <inertial> with a positive mass")
+    if urdf.notes:  # a hand's inertias hardly matter, an object's do
+        raise DescriptionError(urdf.path, f"link '{body.name}': its <inertial> is of no solid body")
     if body.has_mesh or not body.collisions:
         problem = "contacts need <collision> shapes made of box, cylinder, sphere or capsule only"
         found = "a mesh" if body.has_mesh else "no shape"

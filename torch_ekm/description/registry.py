@@ -8,6 +8,7 @@ from pathlib import Path
 
 from .._files import read_file
 from ..exceptions import DescriptionError, UnknownNameError
+from ._toml import read_toml
 from ._xml import LARGEST
 from .hand import HandDescription
 from .mjcf import mjcf_files
@@ -16,8 +17,8 @@ from .objects import ObjectDescription, read_object
 from .transmission import read_transmission
 from .urdf import read_urdf
 
-HAND_FILES = (".urdf", ".xml")
-"""How the file of a hand may end: URDF, MJCF."""
+HAND_FILES = (".urdf", ".xml", ".mjcf")
+"""How the file of a hand may end: a URDF first, else it is an MJCF."""
 _HANDS = {
     "icub_right": "icub_right_hand.urdf",
     "icub_left": "icub_left_hand.urdf",
@@ -58,19 +59,23 @@ def list_cylinders() -> tuple[str, ...]:
 def load_hand(name: str | Path) -> HandDescription:
     """A hand by name, or from a path to a URDF with ``<stem>.transmission.toml`` next to it.
 
-    An MJCF (``.xml``, extra ``mujoco``) says itself what transmits its motors; a transmission file next to it
-    has the last word, and adds the pads.
+    An MJCF (``.xml`` or ``.mjcf``, extra ``mujoco``) says itself what transmits its motors; a transmission
+    file next to it has the last word, and adds the pads.
 
     Raises:
-        UnknownNameError: ``name`` is neither a known hand nor a path to a ``.urdf`` or ``.xml`` file.
+        UnknownNameError: ``name`` is neither a known hand nor a path to a ``.urdf``, ``.xml`` or ``.mjcf``
+            file.
         DescriptionError: a file is missing or wrong; the message names file and place.
         JointMismatchError: URDF and transmission file name different joints.
     """
     path, transmission = hand_paths(name)
-    if path.suffix == ".xml":
-        mjcf = read_mjcf(path)
-        return read_transmission(transmission, mjcf.urdf, mjcf)
-    return read_transmission(transmission, read_urdf(path))
+    if path.suffix == ".urdf":
+        return read_transmission(transmission, read_urdf(path))
+    said = read_toml(transmission, "transmission file") if transmission.is_file() else {}
+    hand, joints = said.get("hand"), said.get("joints")
+    base = hand.get("base_link") if isinstance(hand, dict) else None
+    mjcf = read_mjcf(path, base, joints if isinstance(joints, dict) else ())
+    return read_transmission(transmission, mjcf.urdf, mjcf)
 
 
 def load_object(name: str | Path) -> ObjectDescription:
@@ -119,7 +124,7 @@ def file_digests(hand: str | Path, objects: Iterable[str | Path]) -> dict[str, s
     """
     described, transmission = hand_paths(hand)
     files = [described, transmission]
-    if described.suffix == ".xml":  # which may be of several files, and say it all
+    if described.suffix != ".urdf":  # which may be of several files, and say it all
         files = [*mjcf_files(described), *([transmission] if transmission.exists() else [])]
     named = [("hand", path) for path in files]
     named += [("object", path) for item in objects for path in object_paths(item)]

@@ -11,14 +11,19 @@ import numpy as np
 
 from .._files import write_whole
 from ..exceptions import DescriptionError, UnknownNameError
+from ._toml import TODO
+from .branch import hand_below
 from .mjcf_hand import MjcfHand, read_mjcf
 from .registry import HAND_FILES
-from .transmission import TODO
+from .transmission import unheld_of
 from .transmission_file import document, toml_key
 from .urdf import UrdfModel, read_urdf
 
 _ROUND = ("capsule", "sphere")
 _ONE_PLANE = 1e-3  # [m]
+_MANY = 40  # joints: more than a hand has
+ASSUMED = "# Assumed: "
+"""Begins a line of the file that says what was assumed."""
 _HEAD = """\
 # What {urdf} cannot describe of this hand. Begun by 'torch-ekm hands --new'.
 # Put a figure wherever "TODO" stands; 'torch-ekm check {urdf}' lists what is missing.
@@ -59,56 +64,70 @@ _PADS = """
 """
 
 
-def write_template(urdf: str | Path) -> Path:
+def write_template(urdf: str | Path, base_link: str | None = None) -> Path:
     """Write ``<stem>.transmission.toml`` next to a URDF: all joints, and couplings for ``<mimic>``.
 
-    Of an MJCF: all that it says of its transmission, with notes on what it says and a hand has not.
+    Of an MJCF: all that it says of its transmission. Above stands what was assumed of the file.
     Figures that the file does not state are ``"TODO"``; as long as one is left, ``load_hand`` names them all.
 
     Args:
-        urdf: a path that ends in ".urdf" or ".xml".
+        urdf: a path that ends in ".urdf", ".xml" or ".mjcf".
+        base_link: of a robot: the hand is what this link carries.
 
     Raises:
         UnknownNameError: another ending.
-        DescriptionError: the file is missing or wrong, has no joint that moves, or its transmission file is
-            there already.
+        DescriptionError: the file is missing or wrong, has no such link or no joint that moves, or its
+            transmission file is there already.
         OutputError: the folder cannot be written to.
     """
     path = Path(urdf)
     if path.suffix not in HAND_FILES:
-        raise UnknownNameError("URDF or MJCF", str(urdf), ("a path to a .urdf or .xml file",))
-    mjcf = read_mjcf(path) if path.suffix == ".xml" else None
+        raise UnknownNameError("URDF or MJCF", str(urdf), ("a path to a .urdf, .xml or .mjcf file",))
+    mjcf = read_mjcf(path, base_link) if path.suffix != ".urdf" else None
     model = read_urdf(path) if mjcf is None else mjcf.urdf
+    model = hand_below(model, base_link or model.root)
+    notes = list(model.notes)
+    if base_link is None and (count := len(model.moving_joints)) > _MANY:
+        notes.append(f"all {count} joints are the hand's; of a robot, --base LINK keeps those beyond a link")
     written = path.with_suffix(".transmission.toml")
     if not model.moving_joints:
-        raise DescriptionError(path, "there is no revolute or continuous joint")
+        raise DescriptionError(path, "; ".join(["there is no revolute or continuous joint", *notes]))
     if written.exists():
         raise DescriptionError(written, "is there already and is not overwritten; move it away first")
-    write_whole(written, template(model) if mjcf is None else mjcf_template(mjcf))
+    text = template(model, base_link) if mjcf is None else mjcf_template(mjcf)
+    said = "".join(f"{ASSUMED}{_comment(note)}\n" for note in notes)
+    write_whole(written, text.replace("\n[hand]\n", f"{said}\n[hand]\n", 1))
     return written
 
 
 def mjcf_template(mjcf: MjcfHand) -> str:
-    """The text of the transmission file of an MJCF, with TODO for what its pads need."""
-    notes = [f"# {_comment(note)}" for note in mjcf.notes]
+    """The text of the transmission file of an MJCF, with TODO for pads, and for what it needs and has not."""
     head = _MJCF_HEAD.format(mjcf=_comment(mjcf.urdf.path.name)).rstrip("\n")
-    lines = [head, *(["#", *notes] if notes else []), "", document(mjcf.tables).rstrip("\n")]
+    joints = mjcf.tables["joints"]
+    loose = {name: joints[name] | {"spring": TODO} for name in unheld_of(mjcf)}
+    tables = mjcf.tables | {"joints": joints | loose}
+    lines = [head, "", document(tables).rstrip("\n")]
+    if not mjcf.tables["actuators"]:
+        lines += _actuators(mjcf.urdf)
     return "\n".join([*lines, *_pads(mjcf.urdf)]) + "\n"
 
 
-def template(model: UrdfModel) -> str:
+def template(model: UrdfModel, base_link: str | None = None) -> str:
     """The text of the transmission file, with TODO where the URDF has no figure."""
-    base = _base(model)
+    base = base_link or _base(model)
     normal = _planar_normal(model, base)
     head = _HEAD.format(urdf=_comment(model.path.name), name=_text(model.name), base=_text(base))
     lines = [head.rstrip("\n")]
     if normal is not None:
         lines.append(f"planar_normal = {_vector(normal)}  # all joints turn in one plane: a planar hand")
-    lines += [_JOINTS.rstrip("\n"), *_joints(model), *_couplings(model), _ACTUATORS.rstrip("\n")]
-    fingers = _fingers(model)
-    for k, finger in enumerate(fingers, start=1):
-        lines += _actuator(model, finger, f"finger_{k}")
-    return "\n".join([*lines, *_pads(model)]) + "\n"
+    lines += [_JOINTS.rstrip("\n"), *_joints(model), *_couplings(model)]
+    return "\n".join([*lines, *_actuators(model), *_pads(model)]) + "\n"
+
+
+def _actuators(model: UrdfModel) -> Iterator[str]:
+    yield _ACTUATORS.rstrip("\n")
+    for k, finger in enumerate(_fingers(model), start=1):
+        yield from _actuator(model, finger, f"finger_{k}")
 
 
 def _pads(model: UrdfModel) -> Iterator[str]:
@@ -122,20 +141,25 @@ def _joints(model: UrdfModel) -> Iterator[str]:
     tied = {mimic.joint: mimic for mimic in model.mimics}
     rest = {joint.name: min(max(0.0, joint.lower), joint.upper) for joint in model.moving_joints}
     for _ in tied:  # as many sweeps as ties reach the end of a chain of them
-        rest |= {name: tie.multiplier * rest[tie.other] + tie.offset for name, tie in tied.items()}
+        rest |= {name: tie.multiplier * rest.get(tie.other, 0.0) + tie.offset for name, tie in tied.items()}
     for joint in model.moving_joints:
         limits = f"{math.degrees(joint.lower):.6g} to {math.degrees(joint.upper):.6g} deg"
         limits = limits if math.isfinite(joint.lower + joint.upper) else "no limits"
         about = f"{joint.kind}, {limits}, from {_comment(joint.parent)} to {_comment(joint.child)}"
         spring = "0.0" if joint.name in tied or joint.lower == joint.upper else _text(TODO)
-        about += f", tied to {_comment(tied[joint.name].other)}" if joint.name in tied else ""
+        if joint.name in tied:
+            tie = tied[joint.name]
+            about += f", tied to {_comment(tie.other)}" if tie.multiplier else ", locked"
         figures = f"spring = {spring}, rest_deg = {math.degrees(rest[joint.name]):.9g}, friction = 0.0"
         yield f"{toml_key(joint.name)} = {{ {figures} }}  # {about}"
 
 
 def _couplings(model: UrdfModel) -> Iterator[str]:
     """Sum of weight * joint angle stays what it is at rest."""
-    rows = [(f"{tie.joint} mimics {tie.other}", tie.coupling()) for tie in model.mimics]
+    rows = [
+        (f"{tie.joint} mimics {tie.other}" if tie.multiplier else f"{tie.joint} is locked", tie.coupling())
+        for tie in model.mimics
+    ]
     tied = {tie.joint for tie in model.mimics}
     for joint in model.moving_joints:
         if joint.lower == joint.upper and joint.name not in tied:

@@ -1,32 +1,37 @@
 """Read a transmission file: what a URDF cannot describe of a hand.
 
-Actuators and their moment arms (J_a), rigid couplings (C dq = 0), joint springs and friction,
+Actuators and their moment arms (J_a), rigid couplings (C dq = 0), loops, springs over joints and tendons,
 contact pads, Hall sensors. The format is documented in ``docs/reference/file_formats.md``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from ..exceptions import DescriptionError, JointMismatchError
-from ._toml import TomlTable, read_toml
+from ..typing import Array
+from ._toml import TODO, TomlTable, read_toml
+from .branch import hand_below
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
-from .mimic import check_mimics
+from .length_tables import LOOP, SPRING, LengthReader
+from .lengths import Lengths, Loops, TendonSprings
+from .mimic import overruled, unheld_joints
 from .mjcf_hand import MjcfHand
 from .urdf import UrdfModel
 
-#: Stands for a figure that is still to be filled in.
-TODO = "TODO"
-TABLES = ("hand", "joints", "actuators", "couplings", "pads", "hall_sensors", "notes")
+TABLES = (
+    "hand", "joints", "actuators", "couplings", "tendon_springs", "loops", "pads", "hall_sensors", "notes",
+)  # fmt: skip
 HAND = ("name", "base_link", "planar_normal", "gravity", "pinch_force")
 JOINT = ("spring", "rest", "rest_deg", "friction")
 ACTUATOR = (
-    "name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "tendon", "stiffness",
-    "backlash", "backlash_deg", "posture",
+    "name", "range", "range_deg", "offset", "offset_deg", "moment_arms", "mjcf_tendons", "tendon",
+    "stiffness", "backlash", "backlash_deg", "posture",
 )  # fmt: skip
 COUPLING = ("name", "joints")
 PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
@@ -55,25 +60,22 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     top = TomlTable(path, "top level", data, TABLES)
     if not isinstance(data.get("notes", {}), dict):
         raise top.error("'notes' must be a table of text, which no program reads")
+    hand = TomlTable(path, "[hand]", top.data.get("hand"), HAND)
+    base, given = hand.text("base_link", urdf.root), top.data.get("joints", {})
+    robot, urdf = urdf, hand_below(urdf, base, given if isinstance(given, dict) else (), path)
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
-        raise DescriptionError(urdf.path, "there is no revolute or continuous joint")
-    hand = TomlTable(path, "[hand]", top.data.get("hand"), HAND)
-    base = hand.text("base_link", urdf.root)
-    _check_base(path, base, urdf)
-
-    springs = _joint_table(path, top.data.get("joints", {}), names)
-    actuators = _each(top, "actuators", lambda place, data: _actuator(path, place, data), minimum=1)
-    couplings = _each(top, "couplings", lambda place, data: TomlTable(path, place, data, COUPLING))
-    J_a = _rows(path, names, [(f"actuator '{a.name}'", arms) for a, arms in actuators])
-    C = _rows(path, names, [(table.place, table.weights("joints")) for table in couplings])
-    K_s = springs[:, 0]
-    check_mimics(path, urdf.path, urdf.mimics, names, C, springs[:, 1])
-    _check_mechanism(path, names, J_a, C, K_s)
+        raise hand.error(f"base_link '{base}' carries no revolute or continuous joint")
+    springs = _joint_table(path, given, names, {joint.name for joint in robot.moving_joints})
+    mechanism = _mechanism(top, LengthReader(urdf, names, springs[:, 1], mjcf), springs[:, 0])
+    actuators = [_actuator(table) for table in mechanism.motors]
+    J_a, C = mechanism.lengths.typical, mechanism.C
+    notes = overruled(urdf.mimics, names, C, springs[:, 1])
+    _check_mechanism(path, mechanism)
     pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
     hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
-    _check_unique(path, "actuator", [actuator.name for actuator, _ in actuators])
+    _check_unique(path, "actuator", [actuator.name for actuator in actuators])
     _check_unique(path, "pad", [pad.name for pad in pads])
     _check_unique(path, "Hall channel", [str(sensor.channel) for sensor in hall])
     normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
@@ -87,10 +89,10 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
         joint_names=names,
         joint_lower=np.array([joint.lower for joint in joints]),
         joint_upper=np.array([joint.upper for joint in joints]),
-        actuators=tuple(actuator for actuator, _ in actuators),
+        actuators=tuple(actuators),
         actuation_jacobian=J_a,
         coupling=C,
-        spring_stiffness=K_s,
+        spring_stiffness=springs[:, 0],
         spring_rest=springs[:, 1],
         joint_friction=springs[:, 2],
         pads=tuple(pads),
@@ -98,8 +100,63 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
         planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
         gravity=(gravity[0], gravity[1], gravity[2]),
         pinch_force=hand.number("pinch_force", HandDescription.pinch_force, positive=True),
-        notes=() if mjcf is None else tuple(mjcf.notes),
+        notes=(*urdf.notes, *notes),
+        arm_functions=None if mechanism.lengths.constant else mechanism.lengths,
+        tendon_springs=mechanism.tendon_springs,
+        loops=mechanism.loops,
     )
+
+
+@dataclass(frozen=True)
+class _Mechanism:
+    """What holds the joints, before any figure of the motors is asked for."""
+
+    names: tuple[str, ...]
+    rest: Array
+    spring: Array
+    motors: list[TomlTable]
+    lengths: Lengths
+    C: Array
+    tendon_springs: TendonSprings | None
+    loops: Loops | None
+
+    @property
+    def unheld(self) -> list[str]:
+        """Joints that nothing holds at the springs' rest, as if all springs of tendons were stretched."""
+        K, rows = np.diag(self.spring), np.vstack([self.lengths.typical, self.C])
+        if self.tendon_springs is not None:
+            arms = self.tendon_springs.lengths.typical
+            K = K + arms.T @ (self.tendon_springs.stiffness[:, None] * arms)
+        if self.loops is not None:
+            rows = np.vstack([rows, self.loops.lengths.jacobian(self.rest)])
+        return unheld_joints(self.names, rows, K)
+
+
+def _mechanism(top: TomlTable, reader: LengthReader, spring: Array) -> _Mechanism:
+    def each(key: str, valid: tuple[str, ...]) -> list[TomlTable]:
+        return _each(top, key, lambda place, data: TomlTable(top.path, place, data, valid))
+
+    motors, couplings = each("actuators", ACTUATOR), each("couplings", COUPLING)
+    weights = [(table.place, table.weights("joints")) for table in couplings]
+    return _Mechanism(
+        names=reader.names,
+        rest=reader.rest,
+        spring=spring,
+        motors=motors,
+        lengths=reader.lengths(motors),
+        C=_rows(top.path, reader.names, weights),
+        tendon_springs=reader.springs(each("tendon_springs", SPRING)),
+        loops=reader.loops(each("loops", LOOP)),
+    )
+
+
+def unheld_of(mjcf: MjcfHand) -> list[str]:
+    """The joints of an MJCF that nothing holds, as far as it says: no spring, actuator, coupling or loop."""
+    path, urdf = mjcf.urdf.path, mjcf.urdf
+    names = tuple(joint.name for joint in urdf.moving_joints)
+    springs = _joint_table(path, mjcf.tables["joints"], names, set())
+    top = TomlTable(path, "top level", mjcf.tables, TABLES)
+    return _mechanism(top, LengthReader(urdf, names, springs[:, 1], mjcf), springs[:, 0]).unheld
 
 
 def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
@@ -123,12 +180,10 @@ def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
         raise DescriptionError(path, f"still to be filled in ({len(left)} figures): {', '.join(left)}")
 
 
-def _each(top: TomlTable, key: str, read: Callable[[str, Any], T], minimum: int = 0) -> list[T]:
+def _each(top: TomlTable, key: str, read: Callable[[str, Any], T]) -> list[T]:
     entries = top.data.get(key, [])
     if not isinstance(entries, list):
         raise DescriptionError(top.path, f"'{key}' must be written as [[{key}]], one table for each")
-    if len(entries) < minimum:
-        raise DescriptionError(top.path, f"[[{key}]]: at least {minimum} such table(s) must be given")
     results = []
     for k, data in enumerate(entries):
         label = data.get("name", data.get("joint", k + 1)) if isinstance(data, dict) else k + 1
@@ -136,15 +191,14 @@ def _each(top: TomlTable, key: str, read: Callable[[str, Any], T], minimum: int 
     return results
 
 
-def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, float]]:
-    table = TomlTable(path, place, data, ACTUATOR)
+def _actuator(table: TomlTable) -> Actuator:
     lower, upper = table.angles("range", 2)
     if lower >= upper:
         raise table.error(f"range reversed or empty: {lower:g} to {upper:g} rad")
     backlash = table.angle("backlash", 0.0)
     if backlash < 0:
         raise table.error(f"'backlash' must be at least 0, got {backlash:g} rad")
-    actuator = Actuator(
+    return Actuator(
         name=table.text("name"),
         lower=lower,
         upper=upper,
@@ -154,7 +208,6 @@ def _actuator(path: Path, place: str, data: Any) -> tuple[Actuator, dict[str, fl
         backlash=backlash,
         posture=table.flag("posture", False),
     )
-    return actuator, table.weights("moment_arms")
 
 
 def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
@@ -188,11 +241,14 @@ def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSens
     return HallSensor(joint, channel, table.number("open", 255.0), table.number("closed", 0.0))
 
 
-def _joint_table(path: Path, data: Any, names: tuple[str, ...]) -> np.ndarray:
-    """Rows (spring stiffness [N m/rad], rest [rad], Coulomb friction [N m]) in the order of ``names``."""
+def _joint_table(path: Path, data: Any, names: tuple[str, ...], robot: set[str]) -> np.ndarray:
+    """Rows (spring stiffness [N m/rad], rest [rad], Coulomb friction [N m]) in the order of ``names``.
+
+    Other joints of the ``robot`` may be there.
+    """
     given = TomlTable(path, "[joints]", data, data if isinstance(data, dict) else ()).data
     missing = [name for name in names if name not in given]
-    unexpected = [name for name in given if name not in names]
+    unexpected = [name for name in given if name not in names and name not in robot]
     if missing or unexpected:
         raise JointMismatchError(path, missing, unexpected, names)
     rows = []
@@ -214,39 +270,23 @@ def _rows(path: Path, names: tuple[str, ...], entries: list[tuple[str, dict[str,
     return matrix
 
 
-def _check_mechanism(
-    path: Path, names: tuple[str, ...], J_a: np.ndarray, C: np.ndarray, K_s: np.ndarray
-) -> None:
-    """``[J_a; C]`` must have full row rank, and K_s must hold what it leaves free."""
+def _check_mechanism(path: Path, mechanism: _Mechanism) -> None:
+    """``[J_a; C]`` must have full row rank, and springs and loops must hold what it leaves free."""
+    J_a, C = mechanism.lengths.typical, mechanism.C
+    if not len(J_a):
+        raise DescriptionError(path, "[[actuators]]: at least 1 such table(s) must be given")
     B = np.vstack([J_a, C])
-    _, singular, V = np.linalg.svd(B)
+    singular = np.linalg.svd(B, compute_uv=False)
     rank = int((singular > 1e-9 * singular[0]).sum())
     if rank < len(B):
         parts = f"{len(J_a)} actuators and {len(C)} couplings give only {rank} independent rows"
         raise DescriptionError(path, f"moment arms and couplings must be linearly independent: {parts}")
-    N = V[rank:].T
-    if N.size:
-        stiffness, modes = np.linalg.eigh(N.T @ (K_s[:, None] * N))
-        if stiffness[0] <= 1e-9 * max(1.0, stiffness[-1]):
-            loose = np.abs(N @ modes[:, 0])
-            pairs = zip(names, loose, strict=True)
-            joints = ", ".join(name for name, part in pairs if part > 0.3 * loose.max())
-            problem = f"no spring, actuator or coupling holds the joints {joints}"
-            problem += ": give them a positive 'spring' in [joints]"
-            if path.suffix == ".xml":
-                problem += f" of a transmission file; 'torch-ekm hands --new {path}' writes one"
-            raise DescriptionError(path, problem)
-
-
-def _check_base(path: Path, base: str, urdf: UrdfModel) -> None:
-    """The hand frame must not move: only fixed joints between the root and it."""
-    links = [link.name for link in urdf.links]
-    if base not in links:
-        raise DescriptionError(path, f"[hand]: unknown base_link '{base}'; links are: {', '.join(links)}")
-    moving = [joint.name for joint in urdf.joints_to(base) if joint.kind != "fixed"]
-    if moving:
-        problem = f"base_link '{base}' moves with joint '{moving[-1]}'; choose a fixed link"
-        raise DescriptionError(path, f"[hand]: {problem}")
+    if loose := mechanism.unheld:
+        problem = f"no spring, actuator or coupling holds the joints {', '.join(loose)}"
+        problem += ": give them a positive 'spring' in [joints]"
+        if path.suffix != ".toml":
+            problem += f" of a transmission file; 'torch-ekm hands --new {path}' writes one"
+        raise DescriptionError(path, problem)
 
 
 def _check_unique(path: Path, kind: str, names: Iterable[str]) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 from .._files import write_whole
 from ..exceptions import DescriptionError
+from ..typing import Array
 from ._toml import read_toml
 from .hand import HandDescription
 from .mjcf_hand import read_mjcf
@@ -35,7 +36,7 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
     path = Path(path)
     if not path.name.endswith(_ENDING):
         raise DescriptionError(path, f"the name must end in '{_ENDING}'")
-    if hand.transmission_path.is_file() or hand.urdf_path.suffix != ".xml":
+    if hand.transmission_path.is_file() or hand.urdf_path.suffix == ".urdf":
         data = read_toml(hand.transmission_path, "transmission file")
     else:
         data = read_mjcf(hand.urdf_path).tables
@@ -45,21 +46,42 @@ def write_transmission(hand: HandDescription, path: str | Path) -> Path:
             "rest": float(hand.spring_rest[j]),
             "friction": float(hand.joint_friction[j]),
         }
-    for actuator, table, arms in zip(hand.actuators, data["actuators"], hand.actuation_jacobian, strict=True):
-        named = zip(hand.joint_names, arms, strict=True)
-        table["moment_arms"] = {name: float(arm) for name, arm in named if arm != 0}
+    rows = zip(hand.actuators, data["actuators"], hand.actuation_jacobian, hand.lengths.typical, strict=True)
+    for actuator, table, arms, typical in rows:
+        _write_arms(hand, table, arms * actuator.unit, typical)
         for key in ("stiffness", "offset", "offset_deg", "backlash", "backlash_deg"):
             table.pop(key, None)
         if math.isfinite(actuator.stiffness):
-            table["stiffness"] = float(actuator.stiffness)
+            table["stiffness"] = float(actuator.stiffness) / actuator.unit**2
         for key in ("offset", "backlash"):
             if getattr(actuator, key):
-                table[key] = float(getattr(actuator, key))
+                table[key] = float(getattr(actuator, key)) * actuator.unit
     write_whole(path, document(data))
     urdf = path.with_name(path.name.removesuffix(_ENDING) + ".urdf")
     if not urdf.exists() and hand.urdf_path.suffix == ".urdf":
         write_whole(urdf, hand.urdf_path.read_bytes())
     return path
+
+
+def _write_arms(hand: HandDescription, table: dict[str, Any], arms: Array, typical: Array) -> None:
+    """Constant arms as they are now, functions and tendons by the factors of their typical ones."""
+    if "mjcf_tendons" in table:
+        factor = float(arms @ typical) / float(typical @ typical)
+        table["mjcf_tendons"] = {name: factor * weight for name, weight in table["mjcf_tendons"].items()}
+        return
+    written: dict[str, Any] = {}
+    for name, arm, was in zip(hand.joint_names, arms.tolist(), typical.tolist(), strict=True):
+        value = table["moment_arms"].get(name, 0.0)
+        if isinstance(value, list):
+            value = [coefficient * arm / was for coefficient in value]
+        elif isinstance(value, dict):
+            value = value | {"arm": [one * arm / was for one in value["arm"]]}
+        elif arm != 0:
+            value = arm
+        else:
+            continue
+        written[name] = value
+    table["moment_arms"] = written
 
 
 def document(data: dict[str, Any]) -> str:
@@ -79,6 +101,8 @@ def _value(value: Any) -> str:
         return "[" + ", ".join(map(_value, value)) + "]"
     if isinstance(value, datetime.date | datetime.time):
         return value.isoformat()
+    if isinstance(value, float) and math.isinf(value):
+        return "inf" if value > 0 else "-inf"
     # numbers, booleans and strings are written alike in JSON and in TOML
     return json.dumps(value, ensure_ascii=False)
 

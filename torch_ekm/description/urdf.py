@@ -21,7 +21,7 @@ from .._text import figure
 from ..exceptions import DescriptionError
 from ..typing import Array
 from ._toml import LARGEST_FIGURE
-from ._xml import read_xml
+from ._xml import listed, read_xml
 from .mimic import Mimic, read_mimics
 from .shape import Shape, merge_capsules
 
@@ -29,6 +29,7 @@ from .shape import Shape, merge_capsules
 _MOST = {"link": 400, "joint": 400, "collision": 2000}
 
 MOVING = ("revolute", "continuous")
+_HELD = ("prismatic", "planar", "floating")
 _SHAPES = ("box", "cylinder", "sphere", "capsule", "mesh")
 # what is read of an element: its children, those of them that it needs, ...
 _CHILDREN = {
@@ -38,7 +39,7 @@ _CHILDREN = {
     "geometry": _SHAPES,
     "joint": ("parent", "child", "origin", "axis", "limit", "mimic"),
 }
-_NEEDED = {"inertial": ("mass", "inertia"), "collision": ("geometry",), "joint": ("parent", "child")}
+_NEEDED = {"collision": ("geometry",), "joint": ("parent", "child")}
 # ... and the attributes that hold figures: those that it needs, and the others
 _FIGURES = {
     "origin": ((), ("xyz", "rpy")),
@@ -53,6 +54,10 @@ _FIGURES = {
     "capsule": (("radius", "length"), ()),
 }
 _TRIPLES = ("xyz", "rpy", "size")
+
+_NOTHING = 1e-9  # of the largest principal inertia: zero, rounded
+_ROD = 1e-3  # least principal inertia of the largest
+_BALL = 0.005  # [m] radius
 
 
 @dataclass(frozen=True)
@@ -92,7 +97,9 @@ class UrdfModel:
     joints: tuple[UrdfJoint, ...]
     root: str
     mimics: tuple[Mimic, ...] = ()
-    """Joints that are tied to others; the couplings of a transmission file say the same."""
+    """Joints that are tied to others; a transmission file has the last word."""
+    notes: tuple[str, ...] = ()
+    """What was assumed of the file, each in a sentence."""
 
     @property
     def moving_joints(self) -> tuple[UrdfJoint, ...]:
@@ -119,12 +126,14 @@ class UrdfModel:
 
 
 def read_urdf(path: str | Path) -> UrdfModel:
-    """Parse the URDF at ``path``.
+    """Parse the URDF at ``path``; joints that slide or float are held, with a note.
+
+    Inertias that no solid body has are mended for the simulator, with a note: exporters round them.
 
     Raises:
         DescriptionError: no such file, malformed XML, a missing or non-finite figure or one above 1e9, an
-            unknown joint type, a ``<mimic>`` of no joint, reversed limits, links that do not form one tree,
-            or more than 4 MiB, 400 links, 400 joints or 2000 collision shapes.
+            unknown joint type, reversed limits, links that do not form one tree, or more than 4 MiB, 400
+            links, 400 joints or 2000 collision shapes.
         MissingExtraError: yourdfpy is not installed.
     """
     path = Path(path)
@@ -134,17 +143,25 @@ def read_urdf(path: str | Path) -> UrdfModel:
         if there > most:
             raise DescriptionError(path, f"at most {most} elements <{tag}> are read, this file has {there}")
     strict = ET.Element("robot", name=root.get("name", path.stem))
+    held = []
     for element in root:
         if element.tag == "link":
             strict.append(_strict(path, element, _place(path, element)))
         elif element.tag == "joint":
             strict.append(_strict_joint(path, element))
+            held += [element.get("name", "")] if element.get("type") in _HELD else []
     document = io.BytesIO(ET.tostring(strict))
     robot = require("yourdfpy").URDF.load(document, build_scene_graph=False, load_meshes=False).robot
-    links = tuple(_link(path, link) for link in robot.links)
+    mended: list[str] = []
+    links = tuple(_link(path, link, mended) for link in robot.links)
     joints = tuple(_joint(path, joint) for joint in robot.joints)
     base = _root(path, links, joints)
-    return UrdfModel(path, robot.name, links, joints, base, read_mimics(path, robot.joints))
+    mimics, notes = read_mimics(robot.joints)
+    if held:
+        notes.append(listed("joints that slide or float are held at 0", held))
+    if mended:
+        notes.append(listed("inertias of no solid body (zero, rounded) are mended for the simulator", mended))
+    return UrdfModel(path, robot.name, links, joints, base, mimics, tuple(notes))
 
 
 def _place(path: Path, element: ET.Element) -> str:
@@ -156,13 +173,17 @@ def _place(path: Path, element: ET.Element) -> str:
 
 def _strict_joint(path: Path, element: ET.Element) -> ET.Element:
     place, kind = _place(path, element), element.get("type", "")
+    if kind in _HELD:
+        kind = "fixed"
     if kind not in (*MOVING, "fixed"):
         valid = "revolute, continuous and fixed"
         raise DescriptionError(path, f"{place}: type '{kind}' is not supported; supported: {valid}")
     if kind == "revolute" and element.find("limit") is None:
         raise DescriptionError(path, f"{place}: <joint> needs a <limit>")
     unread = {"revolute": (), "continuous": ("limit",), "fixed": ("axis", "limit", "mimic")}
-    return _strict(path, element, place, unread[kind])
+    strict = _strict(path, element, place, unread[kind])
+    strict.set("type", kind)
+    return strict
 
 
 def _strict(path: Path, element: ET.Element, place: str, unread: tuple[str, ...] = ()) -> ET.Element:
@@ -204,16 +225,19 @@ def _figures(path: Path, what: str, text: str, triple: bool) -> str:
     return " ".join(map(repr, values))
 
 
-def _link(path: Path, link: Any) -> UrdfLink:
+def _link(path: Path, link: Any, mended: list[str]) -> UrdfLink:
     """From a ``yourdfpy.Link``."""
     mass, com, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
     if link.inertial is not None:
         frame = _pose(link.inertial.origin)
-        mass, com = link.inertial.mass, frame[:3, 3]
-        inertia = frame[:3, :3] @ link.inertial.inertia @ frame[:3, :3].T
-        problem = inertia_problem(mass, inertia)
-        if problem:
-            raise DescriptionError(path, f"link '{link.name}': {problem}")
+        mass, com = link.inertial.mass or 0.0, frame[:3, 3]
+        inertia = np.zeros((3, 3)) if link.inertial.inertia is None else link.inertial.inertia
+        inertia = frame[:3, :3] @ inertia @ frame[:3, :3].T
+        if mass < 0:
+            raise DescriptionError(path, f"link '{link.name}': the mass must not be negative, got {mass} kg")
+        if inertia_problem(mass, inertia):
+            mended.append(link.name)
+            inertia = mended_inertia(mass, inertia)
     shapes = [_shape(path, link.name, found) for found in link.collisions if found.name != "mesh"]
     has_mesh = len(shapes) < len(link.collisions)
     return UrdfLink(link.name, mass, com, inertia, merge_capsules(tuple(shapes)), has_mesh)
@@ -224,12 +248,26 @@ def inertia_problem(mass: float, inertia: Array) -> str:
     if not 0 < mass < math.inf or not np.isfinite(inertia).all():
         return f"mass and principal inertias must be positive and finite, got a mass of {mass} kg"
     small, middle, large = np.linalg.eigvalsh(inertia)
-    if small <= 0:
+    if small <= _NOTHING * large or large <= 0:
         return "mass and principal inertias must be positive"
     if large > (1 + 1e-3) * (small + middle):  # a thin plate has equality, written with few digits
         figures = f"{small:.3g}, {middle:.3g}, {large:.3g} kg m^2"
         return f"the largest principal inertia must not exceed the sum of the others, got {figures}"
     return ""
+
+
+def mended_inertia(mass: float, inertia: Array) -> Array:
+    """The nearest inertia of a solid body, in the same axes; without mass: none.
+
+    The largest principal inertia stays. One that is less than 1/1000 of it is raised to that (a thin rod has
+    as little), and the two smaller ones to where their sum is the largest. Without any: a ball of 5 mm.
+    """
+    values, axes = np.linalg.eigh(inertia)
+    if mass == 0 or values[2] <= 0:
+        return 0.4 * mass * _BALL**2 * np.eye(3)
+    values = values.clip(_ROD * values[2])
+    values[:2] += max(0.0, values[2] - values[0] - values[1]) / 2
+    return axes @ np.diag(values) @ axes.T
 
 
 def _shape(path: Path, link: str, collision: Any) -> Shape:

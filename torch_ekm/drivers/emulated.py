@@ -31,7 +31,7 @@ class EmulatedPlant(HandDriver):
         self.unit, hand = unit, self.hand
         lower, upper = ([getattr(one, end) for one in wiring.motors] for end in ("lower", "upper"))
         rest = np.clip(hand.spring_rest, hand.joint_lower, hand.joint_upper)
-        here = np.clip(hand.actuator_offset + hand.actuation_jacobian @ rest, lower, upper)
+        here = np.clip(hand.unloaded(rest), lower, upper)
         self._from, self._goal, self._sent = here, here, time.monotonic()
         self._map = ActuationMap(hand)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 
 from ..description import HandDescription
-from ..sensing.joint_estimator import COUPLING_STD, ENCODER_STD
+from ..sensing.joint_estimator import CHORDS, COUPLING_STD, ENCODER_STD
 from ..typing import Float, Tensor
 
 _SENSOR_STD = 0.005  # s_h [rad]
@@ -28,6 +28,7 @@ class Posture:
     """
 
     def __init__(self, hand: HandDescription, sensed: Sequence[str]) -> None:
+        self._hand = hand
         n, all_sensed = hand.n_q, tuple(sensed) == hand.joint_names
         S = torch.eye(n, dtype=torch.float64)[[hand.joint_names.index(name) for name in sensed]]
         K = torch.from_numpy(hand.spring_stiffness)
@@ -48,4 +49,10 @@ class Posture:
 
     def __call__(self, h: Float[Tensor, " n"], a: Float[Tensor, " n_a"]) -> Float[Tensor, " n_q"]:
         """q [rad] from the sensed joints' angles h and the encoders a [rad]."""
-        return h.clone() if self._all else self._rest + self._gain @ (torch.cat([h, a]) - self._middle)
+        if self._all:
+            return h.clone()
+        q = self._rest + self._gain @ (torch.cat([h, a]) - self._middle)
+        for _ in range(0 if self._hand.lengths.constant else CHORDS):
+            bent = torch.from_numpy(self._hand.bent(q.numpy()))
+            q = self._rest + self._gain @ (torch.cat([h, a - bent]) - self._middle)
+        return q

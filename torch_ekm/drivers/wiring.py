@@ -161,7 +161,7 @@ class Wiring:
             name = head.text("description")
             beside = path.parent / name
             try:
-                hand = load_hand(beside if beside.suffix in HAND_FILES else name)
+                hand = load_hand(beside if beside.suffix in HAND_FILES else name).counted()
             except UnknownNameError as error:
                 raise head.error(f"'description': {error}") from None
 
@@ -247,17 +247,18 @@ def _channel(
     sign = table.number("sign", 1)
     if sign not in (1, -1):
         raise table.error(f"'sign' must be 1 or -1, got {sign:g}")
-    lower, upper = -math.inf, math.inf
+    lower, upper, unit = -math.inf, math.inf, 1.0
     if names == hand.actuator_names:
-        lower, upper = _range(table, hand.actuators[names.index(name)])
+        own = hand.actuators[names.index(name)]
+        lower, upper = _range(table, own)
+        unit = own.unit if "per_rad" in table.data else 1.0  # the file counts as the description's does
     return Channel(
         name=name,
         id=table.text("id", name) if named else table.whole("id", 0),
         sign=int(sign),
         zero=table.number("zero", 0.0),
-        per_unit=table.number(
-            "per_newton" if "per_newton" in table.data else "per_rad", per_rad, positive=True
-        ),
+        per_unit=unit
+        * table.number("per_newton" if "per_newton" in table.data else "per_rad", per_rad, positive=True),
         lower=lower,
         upper=upper,
         count=table.whole("count", 1, least=1),
@@ -267,7 +268,8 @@ def _channel(
 
 def _range(table: LinedTable, own: Actuator) -> tuple[float, float]:
     """Of a motor [rad]: that of the description, or a part of it."""
-    lower, upper = table.angles("range", 2, (own.lower, own.upper))
+    lower, upper = table.angles("range", 2, (own.lower * own.unit, own.upper * own.unit))
+    lower, upper = lower / own.unit, upper / own.unit
     key = "range_deg" if "range_deg" in table.data else "range"
     shown = [f"{math.degrees(x):.4g}" for x in (lower, upper, own.lower, own.upper)]
     if lower >= upper:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -54,11 +55,11 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         The checks in the order in which faults are best corrected. A fault ends in a row, never in an error.
     """
     try:
-        description = load_hand(hand)
+        description = load_hand(hand).counted()
     except (EKMError, OSError) as error:
         return [Check("hand's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows = [Check("hand's files", "ok", f"{description.n_q} joints, {description.n_a} actuators")]
-    rows += [Check("MJCF", "warning", note) for note in description.notes]
+    rows += [Check("assumed", "warning", note) for note in description.notes]
     pads = list(_pads(description))
     rows += [*pads, *_ranges(description), *_tensions(description)]
     try:
@@ -143,12 +144,13 @@ def _width(obj: ObjectDescription) -> Iterator[Check]:
 
 
 def _tensions(hand: HandDescription) -> Iterator[Check]:
-    """``K_s (q - q0) = J_a^T t + C^T c`` in the hand that touches nothing, over the actuators' range."""
+    """Of each tendon in the hand that touches nothing, over the actuators' range."""
     lower, upper = hand.actuator_lower, hand.actuator_upper
     a = lower + _FRACTIONS[:, None] * (upper - lower)
-    q = ActuationMap(hand).joints(torch.from_numpy(a)).numpy()
-    rows = np.vstack([hand.actuation_jacobian, hand.coupling.reshape(-1, hand.n_q)])
-    tension = ((q - hand.spring_rest) * hand.spring_stiffness) @ np.linalg.pinv(rows)[:, : hand.n_a]
+    anywhere = np.full(hand.n_q, np.inf)  # stops oppose every tendon
+    rods = tuple(dataclasses.replace(one, tendon=False) for one in hand.actuators)  # below 0: slack
+    free = dataclasses.replace(hand, joint_lower=-anywhere, joint_upper=anywhere, actuators=rods)
+    tension = ActuationMap(free).pull(torch.from_numpy(a)).numpy()
     for k, actuator in enumerate(hand.actuators):
         if not actuator.tendon:
             continue

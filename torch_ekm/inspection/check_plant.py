@@ -62,7 +62,8 @@ class _Checked:
         self.plant, self.hand, self.object = plant, hand, obj
         self._gate = Gate(plant, hand)
         self.wiring: Wiring | None = getattr(plant, "wiring", None)
-        self.free = ActuationMap(hand).free_motion.numpy()
+        middle = torch.from_numpy((hand.actuator_lower + hand.actuator_upper) / 2)
+        self.free = ActuationMap(hand).free_motion(middle).numpy()
         self.looks: list[Observation] = []
 
     def rows(self) -> Iterator[Check]:
@@ -349,7 +350,7 @@ class _Checked:
         return sorted(found, key=lambda one: one[0])
 
     def _unexplained(self, readings: Readings) -> Check:
-        off = readings.a - self.hand.actuator_offset - self.hand.actuation_jacobian @ readings.q
+        off = readings.a - self.hand.unloaded(readings.q)
         i = int(np.argmax(np.where(self.test.rows, np.abs(off), 0)))
         name = self.hand.actuator_names[i]
         found = (

@@ -88,7 +88,7 @@ def _motions(
             ours = f"'{hand.name}' has {hand.n_q} and {hand.n_a}"
             raise StateError(f"trial {trial} is of {q.shape[1]} joints and {a.shape[1]} actuators, {ours}")
         v, w = np.stack([one.numpy() for one in log.commands]), np.diff(a, axis=0)
-        pulled, s = np.diff(q, axis=0) @ hand.actuation_jacobian.T, np.sign(v)
+        pulled, s = np.diff(hand.unloaded(q), axis=0), np.sign(v)
         moved = (np.abs(v) > ServoModel.resolution) & (a[1:] > low) & (a[1:] < high)
         held = [one.status is not PlantStatus.LOST for one in log.observations]
         for k in range(len(v)):

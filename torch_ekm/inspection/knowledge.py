@@ -51,7 +51,7 @@ def about(knowledge: HandKnowledge, file: Path, hand: str = "") -> dict[str, str
     """
     named = hand or getattr(knowledge.figures, "hand", "")
     try:
-        knowledge.check(load_hand(named))
+        knowledge.check(load_hand(named).counted())
         against = f"that of '{named}'"
     except EKMError as error:
         against = str(error) if named else "the file names no hand: --hand"

@@ -51,7 +51,7 @@ def new_wiring(port: str, hand: str, bauds: tuple[int, ...] = BAUDS) -> str:
         BusError: no servo answers, or not as many as the hand has actuators; the message lists them.
         UnknownNameError, DescriptionError: there is no such hand.
     """
-    description = load_hand(hand)
+    description = load_hand(hand).counted()
     for baud in bauds:
         bus = DynamixelPort(port, baud)
         try:
@@ -68,7 +68,7 @@ def new_wiring(port: str, hand: str, bauds: tuple[int, ...] = BAUDS) -> str:
         problem = f"{len(ids)} servos answer at {baud} baud ({', '.join(said)})"
         raise BusError(port, f"{problem}; {hand} has {len(names)} actuators: {', '.join(names)}")
     rest = np.clip(description.spring_rest, description.joint_lower, description.joint_upper)
-    a = description.actuator_offset + description.actuation_jacobian @ rest
+    a = description.unloaded(rest)
     most = min(
         one["Current Limit"] * (model.unit_ma if model else 0)
         for one, model in zip(found, models, strict=True)

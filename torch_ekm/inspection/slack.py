@@ -44,7 +44,7 @@ def find_slack(driver: HandDriver, on_step: Callable[[str], object] = lambda tex
     """
     hand, given = driver.hand, driver.wiring
     at_rest = np.clip(hand.spring_rest, hand.joint_lower, hand.joint_upper)
-    taut = hand.actuator_offset + hand.actuation_jacobian @ at_rest
+    taut = hand.unloaded(at_rest)
     found = []
     try:
         here = [  # positions count from where each motor stands

@@ -65,7 +65,7 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
     if object is None:
         if reach:
             raise ParameterError("reach", reach, "False without an object: it is that of a grasp")
-        return view_hand(load_hand(what))
+        return view_hand(load_hand(what).counted())
     plant = SimulatedHand(what, object)
     try:
         seen = plant.reset(seed)
@@ -75,16 +75,12 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
 
 
 def view_hand(hand: HandDescription) -> View:
-    """``q(a) = argmin 1/2 (q - q0)^T K_s (q - q0)  s.t.  J_a q = a - a_0,  C (q - q0) = 0``.
-
-    Each actuator closes and opens. The hand touches nothing; joint stops are kept.
-    """
+    """Where the hand rests that touches nothing, while each actuator closes and opens."""
     upper = np.array([part.upper for part in hand.actuators])
     start = np.clip(0.0, [part.lower for part in hand.actuators], upper)
     ways = np.r_[np.linspace(0, 1, _FRAMES), np.linspace(1, 0, _FRAMES)]
     postures = [start, *(start + way * np.diag(upper - start)[i] for i in range(hand.n_a) for way in ways)]
     q = ActuationMap(hand).joints(torch.from_numpy(np.array(postures))).numpy()
-    q = q.clip(hand.joint_lower, hand.joint_upper)
     scene = make_scene(hand, None, q, None, None, np.array(hand.gravity))
     return View(hand.name, scene, notes=tuple(visuals(hand.urdf).problems))
 
@@ -157,7 +153,7 @@ def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool 
     for name in ("hand", "object"):
         if not isinstance(configuration.get(name), str):
             raise DescriptionError(log, f"its configuration names no {name}, needed to draw it")
-    hand, obj = load_hand(configuration["hand"]), load_object(configuration["object"])
+    hand, obj = load_hand(configuration["hand"]).counted(), load_object(configuration["object"])
     gravity = np.array(configuration.get("gravity", hand.gravity), dtype=np.float64)
     states = [seen.state if estimates else _truth(seen) for seen in trajectory.observations]
     if states[0].q.shape[-1] != hand.n_q:

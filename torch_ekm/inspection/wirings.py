@@ -82,12 +82,12 @@ class WiringTest:
 
     def misfit(self, readings: Readings) -> Array:
         """Each quantity over its tolerance; about 1 and less where all is well."""
-        hand, J_a, rows = self.hand, self.hand.actuation_jacobian, self.rows
-        a, q = readings.a, readings.q
+        hand, rows, a, q = self.hand, self.rows, readings.a, readings.q
+        J_a = hand.lengths.jacobian(q, hand.actuation_jacobian)
         beyond = np.maximum(hand.actuator_lower - a, a - hand.actuator_upper)
         joints = np.maximum(hand.joint_lower - q, q - hand.joint_upper)[self.sensed]
         parts = [np.maximum(np.concatenate([beyond, joints]), 0) / _RANGE]
-        parts.append(np.abs(a - hand.actuator_offset - J_a @ q)[rows] / _STATIC)
+        parts.append(np.abs(a - hand.unloaded(q))[rows] / _STATIC)
         for motion in readings.motions:
             noise = np.sqrt(J_a**2 @ motion.noise**2)
             parts.append(_off(J_a @ motion.q, motion.a, noise)[rows])

@@ -18,6 +18,7 @@ from ..contact.forces.friction import friction_cones, margins
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import AnyArray, Array, Bool, Float, Tensor
+from .arms import SAME, Arms
 from .gradients import differentiable_forces
 from .grasp_forces import ExpectedForces, ForcePrior, GraspForces, as_states, friction_use, margin_std
 from .options import ModelOptions
@@ -58,9 +59,10 @@ class ForceBalance:
         # in a plane the third row of the pose basis is the rotation
         self.moment_rows: Mask = np.any(np.abs(self.pose_basis[3:]) > 1e-9, axis=0)
 
-    def _arms(self) -> Array:
+    def _arms(self, arms: Arms = SAME) -> Array:
         """``(J_a Z)^T`` as it is now: calibration changes the moment arms."""
-        return (self.reduction.actuation.detach().double().cpu().numpy() @ self.joint_basis).T
+        J_a = arms.of(self.reduction.actuation).detach().double().cpu().numpy()
+        return (J_a @ self.joint_basis).T
 
     def held_by_stops(
         self, q: Float[AnyArray, "*batch n_q"], torque: Float[AnyArray, "*batch n_q"]
@@ -87,6 +89,7 @@ class ForceBalance:
         A: Float[AnyArray, "*batch n_h n_s"],
         V_s: Float[AnyArray, "*batch n_s"],
         *,
+        arms: Arms = SAME,
         normal: Float[AnyArray, "*batch n_c"] | None = None,
         expected: ExpectedForces | None = None,
         last: GraspForces | None = None,
@@ -98,6 +101,7 @@ class ForceBalance:
             kin: the contacts.
             A: their constraint matrix.
             V_s: gradient of the potential energy [N m, N].
+            arms: moment arms and loops at these postures.
             normal: measured normal forces [N], NaN where there is no sensor.
             expected: prediction from the state before.
             last: forces of the step before, which stand in where the problem has no answer; None: zeros.
@@ -115,11 +119,20 @@ class ForceBalance:
             kin.models, kin.contacts.friction.tolist(), kin.contacts.torsional_friction.tolist()
         )
         spins = tuple(place for place, row in enumerate(kin.rows) if row % 6 >= 3)
-        actuation = self._arms()
+        actuation, closed = self._arms(), None
+        if arms.closed is not None:
+            closed = as_states(torch.as_tensor(arms.closed).detach().double().cpu().numpy(), 2)
         table: list[tuple] = []
         problems: list[tuple[BalanceEquations, ForceSolution]] = []
         for k, q_k in enumerate(as_states(q, 1)):
             joints, lower, upper = self._bounded(q_k)
+            bounded = -self.joint_basis[joints].T
+            if arms.ratio is not None:
+                actuation = self._arms(arms.one(k))
+            if closed is not None:  # a loop is a rod whose force nothing bounds
+                bounded = np.concatenate([bounded, Z.T @ closed[k].T], axis=1)
+                free = np.full(len(closed[k]), np.inf)
+                lower, upper = np.append(lower, -free), np.append(upper, free)
             eq = BalanceEquations(
                 object_matrix=object_matrix[k],
                 object_load=object_load[k],
@@ -130,7 +143,7 @@ class ForceBalance:
                 moment_rows=self.moment_rows,
                 tendon=self.tendon,
                 spin_columns=spins,
-                bound_matrix=-self.joint_basis[joints].T,
+                bound_matrix=bounded,
                 bound_lower=lower,
                 bound_upper=upper,
                 measured_normal=None if measured is None else measured[k],
@@ -140,17 +153,19 @@ class ForceBalance:
             solution = contact_forces(eq, options)
             mu, lam = solution.mu, solution.lam
             residual, torque = np.zeros(n_q), np.zeros(n_q)
+            loop = np.zeros(0 if closed is None else closed.shape[1])
             if solution.status is ForceStatus.SOLVED:
                 residual = self.lift @ solution.residual
-                np.add.at(torque, joints, solution.bound)
+                np.add.at(torque, joints, solution.bound[: len(joints)])
+                loop = solution.bound[len(joints) :]
             elif last is not None:
                 mu, lam = (as_states(x.expand(*batch, -1), 1)[k] for x in (last.mu, last.lam))
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
-            table.append((mu, lam, residual, torque, *margins(cones, mu), [solution.violation]))
+            table.append((mu, lam, residual, torque, *margins(cones, mu), [solution.violation], loop))
             problems.append((eq, solution))
 
-        names = ("mu", "lam", "residual", "stop_torque", "margin", "relative_margin", "violation")
+        names = ("mu", "lam", "residual", "stop_torque", "margin", "relative_margin", "violation", "loop")
         ends = np.cumsum([len(part) for part in table[0]])[:-1]
         stacked = np.stack([np.concatenate(row) for row in table]).reshape(*batch, -1)
         parts: dict[str, Any] = dict(zip(names, np.split(stacked, ends, axis=-1), strict=True))
@@ -159,7 +174,7 @@ class ForceBalance:
         parts["violation"] = parts["violation"][..., 0]
         inputs = (*given, self.reduction.actuation)
         if isinstance(q, Tensor) and torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
-            moving = self._with_graph(problems, *given, *(parts[name] for name in names[:3]))
+            moving = self._with_graph(problems, arms, *given, *(parts[name] for name in names[:3]))
             parts.update(zip(names, moving, strict=False))
         status = tuple(solution.status for _, solution in problems)
         forces = pack_forces(kin, **parts, status=status)
@@ -173,6 +188,7 @@ class ForceBalance:
     def _with_graph(
         self,
         problems: list[tuple[BalanceEquations, ForceSolution]],
+        arms: Arms,
         A: Tensor,
         V_s: Tensor,
         mu: Tensor,
@@ -183,15 +199,22 @@ class ForceBalance:
         n_q, batch = V_s.shape[-1] - 6, mu.dim() - 1
         V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
         Z, Z_p, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.pose_basis, self.lift))
-        J_a = (self.reduction.actuation @ Z).mT
+        at = [arms.one(k) for k in range(len(problems))]
         G, load, hand, V_z = -Z_p.mT @ A[..., n_q:].mT, V_p @ Z_p, Z.mT @ A[..., :n_q].mT, V_q @ Z
         results = []
         for k, (eq, solution) in enumerate(problems):
             own = [x.reshape(-1, *x.shape[batch:])[k] for x in (mu, lam, residual, G, load, hand, V_z)]
             forces = tuple(own[:3])
             if solution.status is ForceStatus.SOLVED:
+                closed = at[k].closed
                 *forces, e = differentiable_forces(
-                    eq, self.options.forces, solution, *own[3:6], actuator_matrix=J_a, hand_load=own[6]
+                    eq,
+                    self.options.forces,
+                    solution,
+                    *own[3:6],
+                    actuator_matrix=(at[k].of(self.reduction.actuation) @ Z).mT,
+                    hand_load=own[6],
+                    closed=None if closed is None else (closed @ Z).mT,
                 )
                 forces = (*forces, lift @ e)
             results.append(forces)

@@ -91,6 +91,7 @@ def differentiable_forces(
     hand_matrix: Tensor,
     actuator_matrix: Tensor,
     hand_load: Tensor,
+    closed: Tensor | None = None,
 ) -> tuple[Float[Tensor, " n_h"], Float[Tensor, " n_a"], Float[Tensor, " n_z"]]:
     """``mu``, ``lam`` and the joint residual of a solved problem, with their derivative at its active set.
 
@@ -102,6 +103,7 @@ def differentiable_forces(
     Args:
         eq, options, solution: the problem and its answer.
         object_matrix, object_load, hand_matrix, actuator_matrix, hand_load: as in ``eq``, with a graph.
+        closed: the last columns of its bound matrix, of loops, likewise.
     """
     cost = force_cost(eq, options)
     problem, scale = force_problem(eq, cost, np.zeros((0, len(solution.mu)))), cost.scale
@@ -128,6 +130,8 @@ def differentiable_forces(
     row_scale = tensor(eq.row_scale)
     G = object_matrix * row_scale[:, None] * s[:n_h]
     bound = tensor(eq.bound_matrix.reshape(len(eq.hand_load), n - n_h - n_a))
+    if closed is not None:
+        bound = torch.cat([bound[:, : bound.shape[1] - closed.shape[1]], closed], dim=1)
     M = torch.cat([hand_matrix, actuator_matrix, bound], dim=1) * s
     stationary = M.mT @ (M @ x_t + hand_load) / options.torque_std**2
     stationary = stationary + torch.nn.functional.pad(G.mT @ tensor(nu[:n_e]), (0, n - n_h))

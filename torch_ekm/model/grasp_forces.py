@@ -6,10 +6,11 @@ Contact forces are stacked as ``[f_1; m_1; f_2; m_2; ..]``, f_i in hand axes [N]
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 
 from .._arrays import namespace, norm
 from .._noise import NOISE
@@ -52,6 +53,8 @@ class GraspForces:
     expected: the smallest forces are a choice, not an estimate."""
     margin_std: Float[Tensor, "*batch n_c"] | None = None
     """Standard deviation of ``margin`` [N]; None likewise."""
+    loop: Float[Tensor, "*batch n_l"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    """nu, forces of the loops, ``-(dc/dq)^T nu`` on the joints."""
 
     @property
     def solved(self) -> bool:

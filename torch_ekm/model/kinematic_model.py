@@ -19,6 +19,7 @@ from ..kinematics.grasp_state import A_STATE, GraspState
 from ..kinematics.hand_kinematics import HandKinematics
 from ..kinematics.link_poses import Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
+from .arms import Arms, arms_at, bends, over_posture
 from .checks import at_pads, check_contacts, check_described, check_inertia, check_state
 from .force_balance import ForceBalance
 from .gradients import following, only_if_asked
@@ -53,7 +54,8 @@ class KinematicModel(nn.Module):
     quasi-static equilibrium; ``docs/explanation/quasi_static_model.md`` has the derivation.
 
     Args:
-        hand: the hand; its gravity is the model's.
+        hand: the hand, whose motors count as :meth:`HandDescription.counted` has them; its gravity is the
+            model's.
         obj: the object: its mass, centre of mass and surfaces.
         options: what to take into account.
         kinematics: in place of :class:`~torch_ekm.kinematics.HandKinematics`.
@@ -93,6 +95,7 @@ class KinematicModel(nn.Module):
         super().__init__()
         check_described(hand, obj)
         check_inertia(obj)
+        hand = hand.counted()
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
         self.kinematics = HandKinematics(hand, dtype=dtype) if kinematics is None else kinematics
         if detector is None:
@@ -315,6 +318,7 @@ class KinematicModel(nn.Module):
         kin = self.contact_kinematics(at, in_numpy(contacts) if plain else contacts, poses=poses)
         A = constraint_matrix(kin)
         V_s, V_ss = self.potential(at)
+        arms = arms_at(self.hand, at.q)
         last, measured, before = None, None, () if previous is None else previous.contacts.finger
         if fingertip_force is not None:
             measured = at_pads(self.hand, contacts, fingertip_force, at.q)
@@ -323,22 +327,27 @@ class KinematicModel(nn.Module):
                 last = previous.forces
             readings = None if measured is None else [measured[finger] for finger in contacts.finger]
             touch = None if readings is None else namespace(at.q).stack(readings, -1)
-            forces = self.balance(at.q, kin, A, V_s, normal=touch, expected=expected, last=last)
+            known = {"normal": touch, "expected": expected, "last": last}
+            forces = self.balance(at.q, kin, A, V_s, arms=arms, **known)
 
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:
             o = dataclasses.replace(o, on_unstable=on_unstable)
         f = in_numpy(forces) if plain else forces
         D = self.load_stiffness(kin, f.force, f.spin_moment) + V_ss
+        if arms.varies:
+            n_q, actuation = self.hand.n_q, like(self.reduction.actuation, at.q)
+            D[..., :n_q, :n_q] += bends(self.hand, at.q, actuation, f.lam, f.loop)
         held = self.balance.held_by_stops(at.q, f.stop_torque)
         slack = like(self.balance.slack(forces), at.q)
-        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable)
+        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable, arms)
         found = sensitivities(kin, f, J, dmu)
         dlam, held, stability, D, A, slack = map(torch.as_tensor, (dlam, held, stability, D, A, slack))
         equations = None
         if held.dim() == 1:
             moving = self.moving(contacts)
-            equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving)
+            known = Arms(*(None if part is None else torch.as_tensor(part) for part in arms))
+            equations = MotionEquations(self.reduction, D, A, tuple(kin.rows), held, slack, moving, known)
         reused, names = last is not None, self.hand.joint_names
         doubts = find_doubts(o, names, contacts, forces, stability, reused, measured, before)
         lin = Linearization(
@@ -376,5 +385,9 @@ class KinematicModel(nn.Module):
         V_ss = xp.zeros((*q.shape[:-1], n_q + 6, n_q + 6), dtype=q.dtype, device=q.device)
         V_ss[..., :n_q, :n_q] = xp.diag(springs)
         V_ss[..., n_q:, n_q:] = gravity_hessian(weight, com_lever)
-        V_s = [spring_torque(q, springs, rest), gravity_gradient(weight, com_lever)]
+        torque, over = spring_torque(q, springs, rest), self.hand.tendon_springs
+        if over is not None:
+            torque = torque + over_posture(q, over.torque)
+            V_ss[..., :n_q, :n_q] += over_posture(q, over.stiffness_matrix)
+        V_s = [torque, gravity_gradient(weight, com_lever)]
         return xp.concat(V_s, -1), V_ss

@@ -9,6 +9,7 @@ import torch
 
 from .._arrays import is_plain, like
 from ..typing import Bool, Float, Tensor
+from .arms import SAME, Arms
 from .manipulation import two_stage
 from .reduction import Drives, Reduction
 
@@ -42,6 +43,8 @@ class MotionEquations:
     slack: Bool[Tensor, " n_a"]
     moving: Bool[Tensor, " n_q"]
     """Joints of the fingers that touch."""
+    arms: Arms = SAME
+    """Moment arms and loops at the posture."""
 
     def solve(self, springs: Float[Tensor, " n_q"], drives: Drives) -> Motion:
         """J_m with other figures.
@@ -64,12 +67,14 @@ class Motion:
     """``ds = J_m w`` of one state and one set of figures, and its derivative by the figures."""
 
     def __init__(self, of: MotionEquations, D: Tensor, drives: Drives) -> None:
-        reduction, self._n_h = of.reduction, len(of.rows)
+        reduction, self._n_h, self._arms = of.reduction, len(of.rows), of.arms
         plain = is_plain(D, of.constraints, *drives)
         given = (D, of.constraints, of.held, of.slack, *drives)
         stiffness, A, held, slack, J_a, K_a = (x.numpy() if plain else x for x in given)
         self._S, self._drives = like(reduction.scaled_basis, stiffness), Drives(J_a, K_a)
-        self._system = system = reduction.reduced(stiffness, A, list(of.rows), held, slack, self._drives)
+        self._system = system = reduction.reduced(
+            stiffness, A, list(of.rows), held, slack, self._drives, of.arms
+        )
         self._step = two_stage(system.D, system.E, system.R, system.F, actuators=reduction.actuators)
         self.jacobian: Float[Tensor, "n_s n_a"] = torch.as_tensor(self._S @ self._step.motion)
         """J_m."""
@@ -88,7 +93,8 @@ class Motion:
         """
         system, S, n_h = self._system, self._S, self._n_h
         motion, reaction = self._step.adjoint(system.D, S[rows].mT)
-        J_a, K_a = self._drives
+        (J_a, K_a), arms_at = self._drives, self._arms
+        J_a = arms_at.of(J_a)
         n_q = J_a.shape[1]
         w = like(moved, S)
         ds = (S @ (self._step.motion @ w))[:n_q]
@@ -102,4 +108,5 @@ class Motion:
         pull[:, rigid] = (reaction[n_h : n_h + len(rigid)] / system.arm).mT
         stiffness[:, soft] = -along[:, soft] * (dlam[soft] / K_a[soft])
         arms = -(dlam[:, None] * y[:, None, :] + pull[..., None] * ds)
+        arms = arms_at.of(arms)
         return FigureDerivative(*map(torch.as_tensor, (-y * ds, arms, stiffness)))

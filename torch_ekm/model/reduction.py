@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from .._arrays import like, namespace
+from .._arrays import like, namespace, norm
 from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
 from ..kinematics.null_space import null_space
 from ..typing import AnyArray, Bool, Float, Tensor
+from .arms import SAME, Arms
 from .manipulation import KKTSolution, two_stage
 from .options import ModelOptions
 
@@ -76,12 +77,13 @@ class Reduction(nn.Module):
         held: Bool[AnyArray, "*batch n_q"],
         slack: Bool[AnyArray, "*batch n_a"],
         on_unstable: str,
+        arms: Arms = SAME,
     ) -> GraspResponse:
         """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
 
         ```
         D' = Z^T D Z + B_c^T K_a B_c          compliant actuators stand in the stiffness
-        E  = [A Z; B_r Z; e_j^T Z]            rigid rows: contacts, rigid actuators, held joints
+        E  = [A Z; B_r Z; e_j^T Z; dc/dq Z]   rigid rows: contacts, rigid actuators, held joints, loops
         ```
 
         Args:
@@ -90,19 +92,22 @@ class Reduction(nn.Module):
             held: joints that do not move.
             slack: tendons that pull nothing.
             on_unstable: "raise" or "flag", as the option of this name.
+            arms: at the posture.
         """
         if held.ndim == 1:
-            return self._solve(D, A, rows, held, slack, on_unstable)
+            return self._solve(D, A, rows, held, slack, on_unstable, arms)
         n_q = held.shape[-1]
         pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
-        if len(pattern) == 1 or bool((pattern == pattern[0]).all()):
+        own = arms.varies  # each state then has its own
+        if not own and (len(pattern) == 1 or bool((pattern == pattern[0]).all())):
             return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:], on_unstable)
         batch = held.shape[:-1]
         flat_D, flat_A = D.reshape(-1, *D.shape[-2:]), A.reshape(-1, *A.shape[-2:])
         parts: list[Tensor] = []
-        for unique in torch.unique(pattern, dim=0):
-            at = (pattern == unique).all(-1)
-            one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable
+        for k, unique in enumerate(pattern if own else torch.unique(pattern, dim=0)):
+            at = torch.arange(len(pattern)) == k if own else (pattern == unique).all(-1)
+            there = arms.one(k) if own else arms
+            one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable, there
             group = [torch.as_tensor(part) for part in self._solve(*one)]
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
@@ -116,15 +121,24 @@ class Reduction(nn.Module):
         return Drives(self.actuation, self.stiffness)
 
     def reduced(
-        self, D: Any, A: Any, rows: list[int], held: Any, slack: Any, drives: Drives | None = None
+        self,
+        D: Any,
+        A: Any,
+        rows: list[int],
+        held: Any,
+        slack: Any,
+        drives: Drives | None = None,
+        arms: Arms = SAME,
     ) -> ReducedStep:
         """The equations in permitted coordinates z, scaled, of states in which the same joints are held.
 
         Args:
             D, A, rows, held, slack: as in :meth:`solve`; held and slack of one state.
             drives: in place of the description's.
+            arms: at the posture.
         """
         J_a, K_a = (like(part, D) for part in self.drives) if drives is None else drives
+        J_a = arms.of(J_a)
         n_a, n_q = J_a.shape
         n_h, L, S, xp = len(rows), CHARACTERISTIC_LENGTH, like(self.scaled_basis, D), namespace(D)
         D = _left(S, D @ S)
@@ -142,16 +156,27 @@ class Reduction(nn.Module):
             F = K_B.mT @ eye[soft]
         batch = D.shape[:-2]
         arm = xp.sqrt((B[rigid] ** 2).sum(-1)).clip(1e-12)[:, None]
-        fixed = [part for part in (B[rigid] / arm, S[:n_q][held]) if len(part)]
+        fixed = [B[rigid] / arm, S[:n_q][held]]
+        if arms.closed is not None:
+            rod = like(torch.as_tensor(arms.closed), D)
+            fixed.append(rod / norm(rod).clip(1e-12)[..., None] @ S[:n_q])
+        fixed = [part for part in fixed if len(part)]
         E = xp.concat([A, *(xp.broadcast_to(part, (*batch, *part.shape)) for part in fixed)], -2)
         R = xp.zeros((E.shape[-2], n_a), **kind)
         R[n_h : n_h + len(rigid)] = eye[rigid] / arm
         return ReducedStep(D, E, R, F, row_scale, B, K_a, rigid, soft, arm)
 
     def _solve(
-        self, D: AnyArray, A: AnyArray, rows: list[int], held: AnyArray, slack: AnyArray, on_unstable: str
+        self,
+        D: AnyArray,
+        A: AnyArray,
+        rows: list[int],
+        held: AnyArray,
+        slack: AnyArray,
+        on_unstable: str,
+        arms: Arms = SAME,
     ) -> GraspResponse:
-        system, n_h = self.reduced(D, A, rows, held, slack), len(rows)
+        system, n_h = self.reduced(D, A, rows, held, slack, arms=arms), len(rows)
         try:
             step = two_stage(
                 system.D, system.E, system.R, system.F, on_unstable=on_unstable, actuators=self.actuators

@@ -115,9 +115,13 @@ class ContactAligned(PlantWrapper):
     ) -> int | None:
         """One more joint whose sensor is wrong, by gaps that stay open."""
         at, H = self._gaps(seen, expected, pads)
-        J_a = torch.from_numpy(self.hand.actuation_jacobian)
+        at_q = expected.numpy()
+        J_a = torch.from_numpy(self.hand.lengths.jacobian(at_q, self.hand.actuation_jacobian))
         way = seen.a - torch.from_numpy(self.hand.actuator_offset)
-        differs, M = torch.cat([-at, way - J_a @ expected]), torch.cat([H, J_a])
+        differs, M = (
+            torch.cat([-at, seen.a - torch.from_numpy(self.hand.unloaded(at_q))]),
+            torch.cat([H, J_a]),
+        )
         R = torch.cat([torch.full_like(at, NOISE.gap**2), NOISE.encoder**2 + (NOISE.arm * way) ** 2])
         for pad in ((gap.abs() > _OPEN) & (at.abs() < _FAR)).nonzero().flatten().tolist():
             likely: dict[int, float] = {}

@@ -9,7 +9,9 @@ from .._noise import NOISE
 from ..description import HandDescription
 from ..exceptions import JointMismatchError, ShapeError
 from ..typing import Float, Tensor
-from .hall.calibration import HallCalibration
+from .hall.calibration import HallCalibration, HallEstimate
+
+CHORDS = 20  # steps with typical arms where arms change with the posture
 
 ENCODER_STD, ARM_STD, COUPLING_STD = NOISE.encoder, NOISE.arm, NOISE.coupling  # s_a, and a share; s_c
 
@@ -74,9 +76,16 @@ class JointEstimator:
             raise ShapeError("actuators", f"{(*readings.shape[:-1], self.hand.n_a)}", actuators.shape)
         check_finite("actuators", actuators)
         hall = self.calibration.estimate(readings)
-        weight = hall.std**-2
-        S = self._select
-        J_a, way = self._J_a, actuators.to(torch.float64) - self._offset
+        way = actuators.to(torch.float64) - self._offset
+        found = self._linear(hall, way)
+        for _ in range(0 if self.hand.lengths.constant else CHORDS):
+            found = self._linear(hall, way - torch.from_numpy(self.hand.bent(found.q.numpy())))
+        return found
+
+    def _linear(self, hall: HallEstimate, way: Tensor) -> JointEstimate:
+        """With typical moment arms; way: the encoders less their offsets, and less what the arms bend."""
+        J_a = self._J_a
+        weight, S = hall.std**-2, self._select
         unread = 1 - (hall.std < ENCODER_STD).to(J_a.dtype) @ S
         blind = unread @ J_a.mT.abs() > 0  # a joint of the actuator has no channel that says more
         read = self._fixed + S.mT @ (weight[..., None] * S)

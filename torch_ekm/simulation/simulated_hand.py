@@ -94,7 +94,7 @@ class SimulatedHand:
         if engine not in ENGINES:
             raise UnknownNameError("engine", engine, ENGINES)
         self.engine = engine
-        self.hand = load_hand(hand) if isinstance(hand, str | Path) else hand
+        self.hand = (load_hand(hand) if isinstance(hand, str | Path) else hand).counted()
         self.object = load_object(object) if isinstance(object, str | Path) else object
         self.config = PlantConfig() if config is None else config
         if self.config.gravity is not None:
@@ -316,6 +316,9 @@ class SimulatedHand:
             return False
         if self.engine != "mujoco":
             raise ParameterError("tendon", tendon, '"computed" in SAPIEN; "native" needs engine="mujoco"')
+        if not self.hand.lengths.constant or self.hand.tendon_springs or self.hand.loops:
+            valid = f"\"computed\": '{self.hand.name}' has arms that change, tendon springs or loops"
+            raise ParameterError("tendon", tendon, valid)
         lost = [name for name in _NOT_NATIVE if getattr(self.parameters, name) != 0]
         lost = [name for name in lost if name != "joint_friction" or self.hand.joint_friction.any()]
         if lost:

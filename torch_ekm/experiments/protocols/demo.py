@@ -110,7 +110,7 @@ class Demo(Generalize):
         best = mine.sort_values(["reached", "angle_deg", "true_error_deg"], ascending=[False, False, True])
         turn = best.iloc[0]
         q, position, rotation = (np.array(part) for part in zip(*turn.poses, strict=True))
-        hand, obj = load_hand(self.setting.hand), load_object(self.object)
+        hand, obj = load_hand(self.setting.hand).counted(), load_object(self.object)
         scene = make_scene(hand, obj, q, position, rotation, np.array(hand.gravity))
         what = f"{turn.angle_deg:g} deg (seed {turn.seed}) by the E-KM"
         save_animation(scene, folder / "animation.html")

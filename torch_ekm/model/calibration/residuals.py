@@ -145,7 +145,8 @@ class Evidence:
     def _encoders(self, lin: Linearization, rest: Rest, z: Tensor, at: Figures) -> dict[str, Tensor]:
         lam, actuators = lin.forces.lam, self.model.hand.actuators
         taut = torch.tensor([not actuator.tendon for actuator in actuators]) | (lam < -_SLACK)
-        stretch = rest.a + z - at.offset - at.moment_arms @ rest.state.q
+        bent = torch.from_numpy(self.model.hand.bent(rest.state.q.numpy()))
+        stretch = rest.a + z - at.offset - at.moment_arms @ rest.state.q - bent
         unexplained = taut * (stretch + lam / self.model.reduction.stiffness)
         return _scaled(encoder=unexplained[self.with_offset])
 

@@ -154,7 +154,7 @@ class ContactMotion:
         self._near: _Start | None = None
         self.loads = _loads(start)
         if a is not None:
-            stretch = a.numpy() - model.hand.actuator_offset - laws.J_a @ start.state.q.numpy()
+            stretch = a.numpy() - model.hand.actuator_offset - laws.length(start.state.q.numpy())
             self.loads.pull[laws.soft] = laws.K[laws.soft] * stretch[laws.soft]
         self._zero: dict[str, float] = {}
         self._count_gaps(absolute=a is not None)
@@ -234,7 +234,7 @@ class ContactMotion:
         bears = np.flatnonzero(done.answer.active[:n_c])
         if not len(bears):
             raise NoContactError("no finger touches the object after this motion")
-        program, rates = done.program, laws.response(done.program.problem, done.answer)
+        program, rates = done.program, laws.response(grasp, done.program.problem, done.answer)
         turn = np.einsum("idz,za->ida", grasp.turn, rates.z)  # of the frames that the forces turned with
         return mode_linearization(
             self.model,
@@ -244,7 +244,7 @@ class ContactMotion:
             motion=laws.S @ rates.z,
             normal=rates.lam[:n_c] + np.einsum("id,ida->ia", program.t, turn),
             tangential=rates.t - program.lam[:n_c, None, None] * turn,
-            actuator=laws.actuator_response(rates, n_c),
+            actuator=laws.actuator_response(grasp, rates, n_c),
             stop=laws.stop_torque(program, done.answer),
         )
 
@@ -291,7 +291,7 @@ class ContactMotion:
             if correction and (size < _SAME or (size < _FINE and doing == was)):
                 near = _Start(here, loads, -done.answer.z) if size < _CLOSE else None
                 self._stand(done.state, None, done.loads, near)
-                rates = self._laws.response(done.program.problem, done.answer)
+                rates = self._laws.response(here, done.program.problem, done.answer)
                 return _Substep(done, rates, _slides(done))
             loads, here, was = done.loads, self._place(done.state), doing
             way = way._replace(total=way.total + done.answer.z)
@@ -406,10 +406,12 @@ def _add(total: dict[str, float], more: dict[str, float]) -> None:
 
 def _loads(lin: Linearization) -> ContactLoads:
     forces = lin.forces
-    force, pull, stop = (x.detach().double().numpy() for x in (forces.force, -forces.lam, forces.stop_torque))
+    found = forces.force, -forces.lam, forces.stop_torque, forces.loop
+    force, pull, stop, loop = (x.detach().double().numpy() for x in found)
     return ContactLoads(
         dict(zip(lin.contacts.finger, force, strict=True)),
         dict(zip(lin.contacts.finger, forces.spin_moment.tolist(), strict=True)),
         pull.copy(),
         stop.copy(),
+        loop,
     )

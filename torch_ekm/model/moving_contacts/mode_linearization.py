@@ -60,6 +60,7 @@ def mode_linearization(
         relative_margin=relative,
         violation=torch.zeros((), dtype=torch.float64),
         status=(ForceStatus.SOLVED,),
+        loop=torch.from_numpy(loads.loop),
     )
     stability = torch.tensor(torch.inf, dtype=torch.float64)
     return Linearization(

@@ -16,6 +16,7 @@ from ...kinematics.grasp_state import GraspState
 from ...kinematics.link_poses import Kinematics, LinkPoses
 from ...kinematics.se3 import hat
 from ...typing import AnyArray, Array, Tensor
+from ..arms import arms_at, bends
 from ..linearization import FollowedFigures
 from ..options import ModelOptions
 from ..reduction import Reduction
@@ -60,6 +61,8 @@ class ContactLoads:
     would have to be shortened times its stiffness."""
     stop: Array
     """Torque of joint stops on the joints, ``(n_q,)`` [N m]."""
+    loop: Array
+    """Forces of the loops, ``(n_l,)``."""
 
 
 class PlacedGrasp:
@@ -107,6 +110,15 @@ class PlacedGrasp:
         V_s[:n_q] += springs * (at.q - model.spring_rest.numpy())
         self._V_ss[:n_q, :n_q] += np.diag(springs)
         self.torque = V_s @ S
+        self._arms, self._S_q, loops = arms_at(model.hand, at.q), S[:n_q], model.hand.loops
+        self.closed = np.zeros((0, S.shape[1])) if loops is None else self._arms.closed @ self._S_q
+        """dc/dz of the loops ``(n_l, n_z)``."""
+        self.gap = np.zeros(0) if loops is None else loops.gap(state.q.numpy())
+        """c(q)."""
+
+    def along(self, J_a: Array) -> Array:
+        """dl/dz of the actuators ``(n_a, n_z)``; J_a: of the description, or as it is known."""
+        return np.asarray(self._arms.of(J_a) @ self._S_q)
 
     def stiffness(self, loads: ContactLoads) -> Array:
         """``Z^T D Z`` at these forces, which turn with the normals."""
@@ -115,6 +127,9 @@ class PlacedGrasp:
         spin = np.array([loads.spin.get(name, 0.0) for name in contacts.finger])
         S = model.reduction.scaled_basis.numpy()
         D = model.load_stiffness(self.kin, force, spin) + self._V_ss
+        if self._arms.varies:
+            n_q, J_a = model.hand.n_q, model.reduction.actuation.detach().numpy()
+            D[:n_q, :n_q] += bends(model.hand, self.state.q.numpy(), J_a, -loads.pull, loads.loop)
         D = S.T @ D @ S
         f_hat = hat(force)
         spin_f = (self.kin.spin_jacobian @ S[: model.hand.n_q]).swapaxes(1, 2)
@@ -139,7 +154,7 @@ class PlacedGrasp:
                     t[i, 2] = loads.spin[name] / self.spin_scale[i]
         return lam, t
 
-    def loads(self, lam: Array, t: Array, pull: Array, stop: Array) -> ContactLoads:
+    def loads(self, lam: Array, t: Array, pull: Array, stop: Array, loop: Array) -> ContactLoads:
         """The inverse of :meth:`components`."""
         n_c, d = t.shape
         local = np.zeros((n_c, 3))
@@ -149,7 +164,11 @@ class PlacedGrasp:
         force = (self.frame @ local[:, :, None])[..., 0] / L
         spin = t[:, 2] * self.spin_scale if d == 3 else np.zeros(n_c)
         return ContactLoads(
-            dict(zip(names, force, strict=True)), dict(zip(names, spin.tolist(), strict=True)), pull, stop
+            dict(zip(names, force, strict=True)),
+            dict(zip(names, spin.tolist(), strict=True)),
+            pull,
+            stop,
+            loop,
         )
 
     def follow(self, increment: Array, loads: ContactLoads) -> Array:

@@ -26,6 +26,8 @@ class StepProgram(NamedTuple):
     low: NDArray[np.int64]
     """Joints whose lower stop is in it."""
     high: NDArray[np.int64]
+    rod: Array
+    """Norms of the rows of the loops, by which they are divided."""
 
 
 class Way(NamedTuple):
@@ -55,8 +57,8 @@ class HandLaws:
         self.hand = hand
         self.joints, self.S = model.reduction.joint_basis.numpy(), model.reduction.scaled_basis.numpy()
         self.J_a, self.K = (x.detach().double().numpy() for x in drives)
-        self.B = np.zeros((hand.n_a, self.S.shape[1]))
-        self.B[:, : self.joints.shape[1]] = self.J_a @ self.joints
+        self._B = np.zeros((hand.n_a, self.S.shape[1]))
+        self._B[:, : self.joints.shape[1]] = self.J_a @ self.joints
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
         self.tendon = tendon & (model.options.slack_tension is not None)
         self.soft = np.isfinite(self.K)
@@ -66,6 +68,20 @@ class HandLaws:
         """The others: tendons, and what is rigid."""
         moves = np.abs(self.joints).sum(1) > 1e-9
         self._stops = np.flatnonzero(moves & np.isfinite(hand.joint_lower + hand.joint_upper))
+
+    def arms(self, at: PlacedGrasp) -> Array:
+        """B: dl/dz of the actuators ``(n_a, n_z)``."""
+        return self._B if self.hand.lengths.constant else at.along(self.J_a)
+
+    def length(self, q: Array) -> Array:
+        """l(q) ``(n_a,)``."""
+        return self.hand.lengths.length(q, self.J_a)
+
+    def _lengthened(self, here: PlacedGrasp, way: Way) -> Array:
+        """By how much l(q) has grown in the step so far ``(n_a,)``."""
+        if self.hand.lengths.constant:
+            return self._B @ way.total
+        return self.length(here.state.q.numpy()) - self.length(way.first.state.q.numpy())
 
     def program(
         self, here: PlacedGrasp, loads: ContactLoads, way: Way, gap: Array, load: Array, damping: float
@@ -90,18 +106,24 @@ class HandLaws:
         room = np.concatenate([q[low] - hand.joint_lower[low], hand.joint_upper[high] - q[high]])
         pressed = np.concatenate([loads.stop[low], -loads.stop[high]]).clip(min=0.0)
         n_c, n_stop = len(gap), len(room)
-        B, K = self.B[springs], self.K[springs]
-        pull = way.pull[springs] + K * (way.da[springs] - B @ total)
+        arms, grown = self.arms(here), self._lengthened(here, way)
+        B, K = arms[springs], self.K[springs]
+        pull = way.pull[springs] + K * (way.da[springs] - grown[springs])
+        n_l, rod = len(here.closed), np.maximum(np.sqrt((here.closed**2).sum(1)), 1e-12)
         problem = StepProblem(
             D=here.stiffness(loads) + B.T @ (K[:, None] * B) + damping * np.eye(len(total)),
             load=here.torque - load - B.T @ pull,
-            E=np.concatenate([-here.normal_rate, self.B[cables], stops]),
-            gap=np.concatenate([gap / L, self.B[cables] @ total - way.da[cables], room]),
-            compliance=np.concatenate(
-                [np.full(n_c, COMPLIANCE), 1 / self.K[cables], np.full(n_stop, COMPLIANCE)]
+            E=np.concatenate([-here.normal_rate, arms[cables], stops, here.closed / rod[:, None]]),
+            gap=np.concatenate(
+                [gap / L, grown[cables] - way.da[cables], room, (here.gap - way.first.gap) / rod]
             ),
-            before=np.concatenate([lam.clip(min=0.0), way.pull[cables], pressed]),
-            one_sided=np.concatenate([np.ones(n_c, bool), self.tendon[cables], np.ones(n_stop, bool)]),
+            compliance=np.concatenate(
+                [np.full(n_c, COMPLIANCE), 1 / self.K[cables], np.full(n_stop, COMPLIANCE), np.zeros(n_l)]
+            ),
+            before=np.concatenate([lam.clip(min=0.0), way.pull[cables], pressed, -rod * loads.loop]),
+            one_sided=np.concatenate(
+                [np.ones(n_c, bool), self.tendon[cables], np.ones(n_stop, bool), np.zeros(n_l, bool)]
+            ),
             T=here.T,
             way=_slid(here, way.first, total),
             tangential_compliance=COMPLIANCE,
@@ -110,25 +132,27 @@ class HandLaws:
         )
         now = loads.pull[cables]
         now = np.where(self.tendon[cables], now.clip(min=0.0), now)
-        return StepProgram(problem, np.concatenate([lam, now, pressed]), t, low, high)
+        return StepProgram(problem, np.concatenate([lam, now, pressed, -rod * loads.loop]), t, low, high, rod)
 
     def loads(self, here: PlacedGrasp, program: StepProgram, answer: StepSolution, way: Way) -> ContactLoads:
         """Forces after a program's answer."""
         n_c, n_k = here.contacts.n_c, len(self.cables)
         lam, t = here.turned(answer.lam[:n_c], answer.t, program.lam[:n_c], program.t, answer.z)
-        stretch = way.da - self.B @ (way.total + answer.z)
+        stretch = way.da - (self._lengthened(here, way) + self.arms(here) @ answer.z)
         pull = way.pull + np.where(self.soft, self.K, 0.0) * np.where(self.soft, stretch, 0.0)
         bearing = answer.lam[n_c : n_c + n_k]
         slack = self.tendon[self.cables] & (bearing <= 0)
         pull[self.cables] = np.where(slack, pull[self.cables].clip(max=0.0), bearing)
-        return here.loads(lam, t, pull, self.stop_torque(program, answer))
+        n_l = len(program.rod)
+        loop = -answer.lam[len(answer.lam) - n_l :] / program.rod
+        return here.loads(lam, t, pull, self.stop_torque(program, answer), loop)
 
     def stop_torque(self, program: StepProgram, answer: StepSolution) -> Array:
         """Of the stops on the joints, ``(n_q,)`` [N m]."""
         n = len(program.problem.mu_s) + len(self.cables)
         stop, n_low = np.zeros(self.hand.n_q), n + len(program.low)
         np.add.at(stop, program.low, answer.lam[n:n_low])
-        np.add.at(stop, program.high, -answer.lam[n_low:])
+        np.add.at(stop, program.high, -answer.lam[n_low : n_low + len(program.high)])
         return stop
 
     def unbalance(self, grasp: PlacedGrasp, loads: ContactLoads) -> Array:
@@ -136,23 +160,24 @@ class HandLaws:
         lam, t = grasp.components(loads)
         pull = np.where(self.tendon, loads.pull.clip(min=0.0), loads.pull)
         contact = grasp.normal_rate.T @ lam + np.einsum("idz,id->z", grasp.T, t)
-        load = grasp.torque + contact - self.B.T @ pull
+        load = grasp.torque + contact - self.arms(grasp).T @ pull + grasp.closed.T @ loads.loop
         load[: self.joints.shape[1]] -= self.joints.T @ loads.stop
         return load
 
-    def response(self, problem: StepProblem, answer: StepSolution) -> Response:
+    def response(self, here: PlacedGrasp, problem: StepProblem, answer: StepSolution) -> Response:
         """How an answer changes with da."""
-        n_a = self.hand.n_a
+        n_a, B = self.hand.n_a, self.arms(here)
         load, gap = np.zeros((len(answer.z), n_a)), np.zeros((len(problem.gap), n_a))
-        load[:, self.springs] = -self.B[self.springs].T * self.K[self.springs]
+        load[:, self.springs] = -B[self.springs].T * self.K[self.springs]
         gap[len(problem.mu_s) + np.arange(len(self.cables)), self.cables] = -1.0
         return answer.response(load, gap)
 
-    def actuator_response(self, rates: Response, n_c: int) -> Array:
+    def actuator_response(self, here: PlacedGrasp, rates: Response, n_c: int) -> Array:
         """dlam/da of the actuators, ``(n_a, n_a)`` [N m/rad]; ``n_c``: number of the program's contacts."""
         change = np.zeros((self.hand.n_a, self.hand.n_a))
         own = np.eye(len(change))[self.springs]
-        change[self.springs] = self.K[self.springs, None] * (self.B[self.springs] @ rates.z - own)
+        B = self.arms(here)[self.springs]
+        change[self.springs] = self.K[self.springs, None] * (B @ rates.z - own)
         change[self.cables] = -rates.lam[n_c : n_c + len(self.cables)]
         return change
 

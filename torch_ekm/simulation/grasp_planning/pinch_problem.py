@@ -6,11 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ...contact import signed_distance
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics
+from ...kinematics.equilibrium import FreeHand
 from ...kinematics.null_space import null_space
 from ...kinematics.se3 import exp
 from ...typing import Array
@@ -23,6 +25,7 @@ from .graspable import object_axes, obstacles
 _THUMB_BENT = (0.65, 0.3, 0.3, 0.5)
 _FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
 _ROOM = 0.02  # [rad] between a motor and the ends of its range
+_CLEAR = 0.002  # [m] that other parts of the hand keep from the object
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class PinchProblem:
         distance_i(q, p) = 0                    each pad touches the object
         G f = -w_gravity                        the object is in balance
         N^T (K_s (q - q0) + J_h^T f) = 0        so are the joints that no actuator fixes,
-                                                N = null([J_a; C])
+                                                N = null([J_a; C; dc/dq])
+        c(q) = 0                                loops close
         -n_thumb . f_thumb = wanted force
 
     with soft wishes: forces well inside the friction cones, pads that meet the object with their
@@ -109,7 +113,8 @@ class PinchProblem:
         self._links = [self.kinematics.link_index(pad.link) for pad in self.pads]
         self._upstream = self.kinematics.upstream.numpy()[self._links]  # (n_c, n_q)
         span = hand.joint_upper - hand.joint_lower
-        self.moving = np.flatnonzero(self._upstream.any(axis=0) & (span > 1e-6))
+        moved = np.asarray(self._upstream.any(axis=0), dtype=bool)
+        self.moving = np.flatnonzero(self._with_loops(moved) & (span > 1e-6))
         self.joint_range = (hand.joint_lower[self.moving], hand.joint_upper[self.moving])
         self._tip = np.array([pad.end for pad in self.pads])
         axis = self._tip - np.array([pad.start for pad in self.pads])
@@ -118,7 +123,7 @@ class PinchProblem:
         self._palmar = np.array([pad.direction for pad in self.pads])
         self._radius = np.array([pad.radius for pad in self.pads])
         links, self._ball, self._ball_radius = obstacles(hand, self.pads)
-        self._ball_link = [self.kinematics.link_index(name) for name in links]
+        self._ball_link = np.array([self.kinematics.link_index(name) for name in links], dtype=np.int64)
         self._prepare_mechanism()
         self.axes = object_axes(obj)
         """Of the object, as columns: long axis, grasp axis, their product."""
@@ -132,16 +137,43 @@ class PinchProblem:
     def _prepare_mechanism(self) -> None:
         hand, J_a = self.hand, self.transmission.J_a
         C = hand.coupling.reshape(-1, hand.n_q)
-        self._passive = null_space(np.vstack([J_a, C])[:, self.moving])
+        closed = np.zeros((0, hand.n_q)) if hand.loops is None else hand.loops.lengths.typical
+        closed = closed / np.linalg.norm(closed, axis=1, keepdims=True)
+        self._passive = null_space(np.vstack([J_a, C, closed])[:, self.moving])
         rest = np.setdiff1d(np.arange(hand.n_q), self.moving)
         self.follow = np.zeros((hand.n_q, len(self.moving)))  # joints that a coupling drags along
         self.follow[self.moving] = np.eye(len(self.moving))
         self.follow[rest] = -np.linalg.pinv(C[:, rest]) @ C[:, self.moving]
-        free = null_space(C)
+        self._free = free = null_space(C)
+        self._constant = hand.lengths.constant and hand.loops is None
         self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
         self.in_use = (J_a @ self.follow).any(axis=1)
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)
+        self._rest()
+
+    def _with_loops(self, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """These joints, and those that move with them through loops."""
+        if (loops := self.hand.loops) is not None:
+            ties = loops.lengths.typical != 0
+            for _ in ties:
+                moving = moving | ties[ties @ moving].any(axis=0)
+        return moving
+
+    def _rest(self) -> None:
+        """Where idle joints are: springs at rest, or at stops where their motors let them be slack."""
+        hand, T = self.hand, self.transmission
+        self._q0 = q0 = T.spring_rest.copy()
+        idle = np.setdiff1d(np.flatnonzero(~self.follow.any(axis=1)), self.moving)
+        stopped = np.clip(q0, hand.joint_lower, hand.joint_upper)
+        slack = T.offset + T.length(stopped)
+        motor = np.where(self.in_use, slack, self._within(slack))
+        if (q0 != stopped)[idle].any() or (slack != motor).any():
+            q0[idle] = FreeHand(hand)(motor + hand.actuator_offset - T.offset).q[idle]
+
+    def _within(self, motor: Array) -> Array:
+        """The nearest positions in the motors' ranges."""
+        return np.clip(motor, self.hand.actuator_lower, self.hand.actuator_upper)
 
     def _unpack(self, x: Array) -> tuple[Array, Array, Array]:
         n = len(self.moving)
@@ -174,7 +206,7 @@ class PinchProblem:
 
     def posture(self, moving: Array) -> Array:
         """All joints, coupled ones following, others at rest ``(*batch, n_q)`` [rad]."""
-        q0 = self.transmission.spring_rest
+        q0 = self._q0
         return q0 + (moving - q0[self.moving]) @ self.follow.T
 
     def _half_bent(self) -> Array:
@@ -186,11 +218,13 @@ class PinchProblem:
                 fraction[joint] = bent[min(place, 3)]
         return low + fraction[self.moving] * (high - low)
 
-    def geometry(self, x: Array) -> PinchGeometry:
+    def geometry(self, x: Array, near: NDArray[np.intp] | None = None) -> PinchGeometry:
         """Forward kinematics and distances of a batch of candidates ``(b, n_x)``.
 
-        Candidates that differ from the last one by their forces alone share its geometry.
+        Candidates that differ from the last one by their forces alone share its geometry. ``near``: numbers
+        of the other parts whose clearance is asked; that of the rest is infinite.
         """
+        near = np.arange(len(self._ball)) if near is None else near
         placed = len(self.moving) + 6  # unknowns before the forces
         own = np.append((x[:-1, :placed] != x[-1, :placed]).any(axis=1), True)
         rows = np.flatnonzero(own)
@@ -204,9 +238,11 @@ class PinchProblem:
         local = np.einsum("bji,bcj->bci", R, centre - o[:, None])
         distance, normal = signed_distance(self.obj.shapes, local)
         n = np.einsum("bij,bcj->bci", R, normal)
-        every = transforms[:, self._ball_link, :3]
-        ball = every[..., 3] + np.einsum("bcij,cj->bci", every[..., :3], self._ball)
-        clearance, _ = signed_distance(self.obj.shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
+        every = transforms[:, self._ball_link[near], :3]
+        ball = every[..., 3] + np.einsum("bcij,cj->bci", every[..., :3], self._ball[near])
+        apart, _ = signed_distance(self.obj.shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
+        clearance = np.full((len(rows), len(self._ball)), np.inf)
+        clearance[:, near] = apart - self._ball_radius[near]
         point = centre - self._radius[:, None] * n
         f = x[:, placed:].reshape(len(x), -1, 3)
         axes, origins = (part.numpy() for part in self.kinematics.joint_axes(poses))
@@ -223,7 +259,7 @@ class PinchProblem:
             facing=(normal @ self.axes[:, 1])[place],
             pad_axis=np.einsum("bcij,cj->bci", turn, self._axis)[place],
             pad_direction=np.einsum("bcij,cj->bci", turn, self._palmar)[place],
-            clearance=(clearance - self._ball_radius)[place],
+            clearance=clearance[place],
             torque=np.einsum("bcqi,bci,cq->bq", lever[place], f, self._upstream),
         )
 
@@ -235,19 +271,23 @@ class PinchProblem:
         force = g.force.sum(axis=1) + weight
         centre = g.rotation @ self.obj.com
         moment = _cross(g.point - g.position[:, None], g.force).sum(axis=1) + _cross(centre, weight)
-        passive = self._joint_load(g)[:, self.moving] @ self._passive
+        passive = self._unheld(g)[:, self.moving] @ self._passive
         press = -np.einsum("bi,bi->b", g.force[:, 0], g.normal[:, 0]) - request.force
-        return np.concatenate(
-            [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1], axis=1
-        )
+        parts = [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1]
+        if (loops := self.hand.loops) is not None:
+            parts.append(loops.gap(g.q) / (1e-4 * np.linalg.norm(loops.lengths.typical, axis=1)))
+        return np.concatenate(parts, axis=1)
 
-    def residuals(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
+    def residuals(
+        self, x: Array, request: PinchRequest, ranges: bool, near: NDArray[np.intp] | None = None
+    ) -> Array:
         """Equations and wishes ``(b, n_r)``, to be squared and summed.
 
         Args:
             ranges: wish that the motors keep to theirs.
+            near: as of :meth:`geometry`.
         """
-        g = self.geometry(x)
+        g = self.geometry(x, near)
         f_n = -np.einsum("bci,bci->bc", g.force, g.normal)
         f_t = np.linalg.norm(g.force + f_n[..., None] * g.normal, axis=-1)
         cone = np.maximum(0.0, f_t - 0.4 * self.obj.friction * f_n) / 0.05
@@ -265,7 +305,7 @@ class PinchProblem:
         tilt = (long_axis - wish) / 0.1
         facing = np.concatenate([-g.facing[:, :1], g.facing[:, 1:]], axis=1)
         opposed = np.maximum(0.0, 0.98 - facing) / 0.05
-        clear = np.maximum(0.0, 0.002 - g.clearance) / 1e-3
+        clear = np.maximum(0.0, _CLEAR - g.clearance) / 1e-3
         posture = (x[:, : len(self.moving)] - self.preferred) / 0.3
         taut = np.maximum(0.0, 0.02 - self.tension(g)[:, self._pulling]) / 0.01
         hard = 3 * self.equations(request, g)
@@ -286,7 +326,8 @@ class PinchProblem:
         T = self.transmission
         stretch = T.stretched(np.where(self.in_use, self.tension(g), 0.0))
         inner = g.q + T.lean(g.torque)
-        return T.offset + T.shape.excursion(inner) @ T.J_a.T + stretch
+        motor = T.offset + T.length(inner) + stretch
+        return np.where(self.in_use, motor, self._within(motor))
 
     def outside(self, g: PinchGeometry) -> Array:
         """How far each motor in use is beyond its range ``(b, n)`` [rad]; negative: inside."""
@@ -295,7 +336,28 @@ class PinchProblem:
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
-        return self._joint_load(g) @ self._to_tension.T
+        load = self._joint_load(g)
+        if self._constant:
+            return load @ self._to_tension.T
+        return self._reactions(g, load)[0][:, : self.hand.n_a]
+
+    def _unheld(self, g: PinchGeometry) -> Array:
+        """What of the joint load neither actuators nor loops nor couplings bear ``(batch, n_q)`` [N m]."""
+        load = self._joint_load(g)
+        if self._constant:
+            return load  # the passive motions are at right angles to all that is borne
+        found, rows = self._reactions(g, load)
+        return (load @ self._free - (found[:, None] @ rows)[:, 0]) @ self._free.T
+
+    def _reactions(self, g: PinchGeometry, load: Array) -> tuple[Array, Array]:
+        """Forces of actuators and loops ``(batch, n)`` and their rows ``(batch, n, n_free)``."""
+        rows = self.transmission.arms(g.q)
+        if (loops := self.hand.loops) is not None:
+            closed = loops.lengths.jacobian(g.q)
+            rows = np.concatenate([np.broadcast_to(rows, (len(closed), *rows.shape[-2:])), closed], axis=1)
+        rows = rows @ self._free
+        found = np.linalg.pinv(rows.swapaxes(-1, -2), rcond=1e-9) @ (load @ self._free)[..., None]
+        return found[..., 0], rows
 
     def _joint_load(self, g: PinchGeometry) -> Array:
         """What springs and contacts ask of the tendons, for moment arms J_a, ``(batch, n_q)`` [N m]."""
@@ -308,10 +370,14 @@ class PinchProblem:
         return wish / np.linalg.norm(wish)
 
     def jacobian(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
-        """Of :meth:`residuals`, central differences, all columns in one batch."""
+        """Of :meth:`residuals`, central differences, all columns in one batch.
+
+        Parts that are clear of the object stay so in a step.
+        """
         step = 1e-6
         shift = step * np.eye(len(x))
-        values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges)
+        near = np.flatnonzero(self.geometry(x[None]).clearance[0] < 2 * _CLEAR)
+        values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges, near)
         return ((values[: len(x)] - values[len(x) :]) / (2 * step)).T
 
 

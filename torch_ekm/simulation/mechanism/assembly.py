@@ -35,11 +35,15 @@ def true_hand(hand: HandDescription, parameters: PlantParameters) -> HandDescrip
         )
         for actuator, limit in zip(hand.actuators, limits.tolist(), strict=True)
     )
+    springs = hand.tendon_springs
+    if springs is not None:
+        springs = dataclasses.replace(springs, stiffness=parameters.spring * springs.stiffness)
     return dataclasses.replace(
         hand,
         actuators=actuators,
         actuation_jacobian=hand.actuation_jacobian * np.broadcast_to(factor, (hand.n_a,))[:, None],
         spring_stiffness=parameters.spring * hand.spring_stiffness,
+        tendon_springs=springs,
         joint_friction=parameters.joint_friction * hand.joint_friction,
     )
 

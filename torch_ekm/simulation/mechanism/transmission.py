@@ -7,10 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from ...description.hand import HandDescription
+from ...description.lengths import Lengths
 from ...typing import Array
 from .departures import CableLosses, JointShape
 
 _COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
+_LOOP_STIFFNESS = 100.0  # [N m/rad] at the joints of a loop: as rigid as an actuator may be
 _BRISTLE_STIFFNESS = 3.0  # k_f [N m/rad]
 _LEANS = 5e-3  # [N m] from which a joint with play is at its end; smooth, as a planner needs it
 _STIFF = 20.0  # [N m/rad] at a joint; up to here the late part damps little
@@ -39,6 +41,9 @@ class Transmission:
     joint to an anchor that slips when the bristle carries the friction torque. It belongs to the
     same drive. PhysX's own joint friction is a fraction of the momentum, not a torque: not used.
 
+    Moment arms may change with the posture: ``J_a q`` is then ``l(q)``. Springs over tendons pull along
+    ``dl/dq``; loops are held by springs of 100 N m/rad at their joints.
+
     Pulleys that are not round and springs that are not linear (``shape``) put ``h(q)`` in the place of q at
     the tendons, ``h'(q)`` on their arms, and ``x (1 + s x^2)`` in the place of ``q - q0``. Friction of the
     cables, hysteresis, coupled tendons and play of joints are ``losses``.
@@ -52,6 +57,7 @@ class Transmission:
 
     def __init__(self, hand: HandDescription, creep: float, shape: JointShape, losses: CableLosses) -> None:
         stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
+        limits = hand.joint_lower, hand.joint_upper
         self.n_a, self.n_q = hand.n_a, hand.n_q
         self.J_a = hand.actuation_jacobian
         self.offset = hand.actuator_offset
@@ -60,7 +66,9 @@ class Transmission:
         coupling = hand.coupling.reshape(-1, hand.n_q)
         S = coupled_posture(coupling)
         away = np.eye(hand.n_q) - S  # how far each follower is from where it should be
-        self._lead = self.J_a @ S
+        self._lead, self._S = self.J_a @ S, S
+        self._lengths = None if hand.lengths.constant else hand.lengths
+        self._springs, self._loops = hand.tendon_springs, hand.loops
         self._M = np.vstack([self._lead, away[np.abs(away).max(axis=1) > 0]])
         self._k = np.concatenate([stiffness, np.full(len(coupling), _COUPLING_STIFFNESS)])
         self._pulls_only = np.concatenate(
@@ -75,12 +83,16 @@ class Transmission:
         rubs = (self.friction > 0) | ((self.losses.capstan > 0) & self._lead.any(axis=0))
         self._k_f = np.where(rubs, _BRISTLE_STIFFNESS, 0.0)
         self._bends = self._reach(self.friction)
-        self.stiff = bool((stiffness[:, None] * self.J_a**2).max() > _STIFF)
+        varied = 1.0 if self._lengths is None else hand.lengths.largest(*limits)
+        tied = list(self._tied(limits))
+        strong = [(stiffness, self.J_a * varied), *tied]
+        self.stiff = bool(max((k[:, None] * arms**2).max() for k, arms in strong) > _STIFF)
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
         self._compliance = self.losses.compliance(stiffness)
         steep = self._k.copy()
         steep[: self.n_a] *= self.losses.steepening
-        size = np.abs(self._M)
+        size = np.abs(np.concatenate([self._lead * varied, self._M[self.n_a :], *(arms for _, arms in tied)]))
+        steep = np.concatenate([steep, *(k for k, _ in tied)])
         carried = (steep * size.sum(axis=1)) @ size if self.stiff else steep @ size**2
         farthest = np.maximum(hand.joint_upper - self.spring_rest, self.spring_rest - hand.joint_lower)
         springs = self.spring_stiffness * self.shape.largest_spring_factor(farthest)
@@ -88,6 +100,33 @@ class Transmission:
         self.drive_stiffness = self._turned + self._k_f
         """Stiffness of each joint's drive ``(n_q,)`` [N m/rad], while all tendons are taut."""
         self.relax(self.spring_rest)
+
+    def _tied(self, limits: tuple[Array, Array]) -> Iterator[tuple[Array, Array]]:
+        """Stiffnesses and largest arms of tendon springs and loops."""
+        if self._springs is not None:
+            lengths = self._springs.lengths
+            yield self._springs.stiffness, lengths.typical * lengths.largest(*limits)
+        if self._loops is not None:
+            lengths = self._loops.lengths
+            arms = lengths.typical * lengths.largest(*limits)
+            self._k_l = _LOOP_STIFFNESS / (arms**2).max(axis=1)
+            yield self._k_l, arms
+
+    def length(self, q: Array) -> Array:
+        """``l(q)`` of the actuators, ``(*batch, n_a)``, with followers where they are."""
+        excursion = self.shape.excursion(q)
+        return excursion @ self.J_a.T if self._lengths is None else self._lengths.length(excursion, self.J_a)
+
+    def arms(self, q: Array) -> Array:
+        """dl/dq of the actuators over the excursion, ``(*batch, n_a, n_q)`` or ``(n_a, n_q)``."""
+        if self._lengths is None:
+            return self.J_a
+        return self._lengths.jacobian(self.shape.excursion(q), self.J_a)
+
+    def _leading(self, q: Array) -> Array:
+        """The excursion at which followers obey the couplings."""
+        rest = self.shape.excursion(self.spring_rest)
+        return rest + self._S @ (self.shape.excursion(q) - rest)
 
     @property
     def stiffness(self) -> Array:
@@ -111,7 +150,9 @@ class Transmission:
 
     def stretch(self, q: Array, motor: Array) -> Array:
         """``m - a0 - J_a q``: elastic stretch of each transmission [rad]; negative: a tendon is slack."""
-        return motor - self.origin - self._lead @ self.shape.excursion(q)
+        if self._lengths is None:
+            return motor - self.origin - self._lead @ self.shape.excursion(q)
+        return motor - self.offset - self._lengths.length(self._leading(q), self.J_a)
 
     def actuator_torque(self, q: Array, motor: Array) -> Array:
         """``-lam``: torque of each actuator along ``+a`` [N m]; never negative for a tendon."""
@@ -141,7 +182,10 @@ class Transmission:
 
     def spring_torque(self, q: Array) -> Array:
         """``k x (1 + s x^2)``, ``x = q - q0``: what the springs oppose ``(*batch, n_q)`` [N m]."""
-        return self.spring_stiffness * self.shape.spring(q - self.spring_rest)
+        torque = self.spring_stiffness * self.shape.spring(q - self.spring_rest)
+        if self._springs is not None:
+            torque = torque + self.shape.arm(q) * self._springs.torque(self.shape.excursion(q))
+        return torque
 
     def drive_targets(self, q: Array, motor: Array) -> Array:
         """Targets that make the drives give the torque above at ``q`` ``(n_q,)`` [rad].
@@ -157,8 +201,13 @@ class Transmission:
         force = np.concatenate([pull, -self._k[self.n_a :] * apart])
         if self._any_tendon:
             force[self._pulls_only & (force < 0)] = 0.0
-        cables = self.shape.arm(inner) * (force @ self._M)
+        along = force @ self._M if self._lengths is None else self._along(self._lengths, inner, force)
+        cables = self.shape.arm(inner) * along
         torque = cables - self.spring_torque(inner)
+        if self._loops is not None:
+            excursion = self.shape.excursion(inner)
+            away = self._k_l * self._loops.gap(excursion)
+            torque = torque - self.shape.arm(inner) * (away @ self._loops.lengths.jacobian(excursion))
         if self.losses.any_play:
             whole = torque + self._turned * self._lean
             half = self.losses.play / 2
@@ -170,6 +219,11 @@ class Transmission:
         slip = np.minimum(np.maximum(q - self._anchor, -reach), reach)  # np.clip takes twice as long
         self._anchor = q - slip
         return q + (torque - self._k_f * slip) / self.drive_stiffness
+
+    def _along(self, lengths: Lengths, q: Array, force: Array) -> Array:
+        """What forces of actuators and couplings do along the excursion ``(n_q,)``."""
+        J_a = lengths.jacobian(self._leading(q), self.J_a) @ self._S
+        return force[: self.n_a] @ J_a + force[self.n_a :] @ self._M[self.n_a :]
 
     def _reach(self, friction: Array) -> Array:
         """How far a bristle bends until it carries the friction torque ``(n_q,)`` [rad]."""
@@ -198,7 +252,7 @@ class Transmission:
         before, ``J^T k s = J_o^T k_o s_o``, which says how much the new tendon is stretched."""
         along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
         stretch = self.stretched(along * other._pull(other.stretch(q, motor)))
-        self.offset = motor - self._followed - self._lead @ self.shape.excursion(q) - stretch
+        self.offset = self.offset + self.stretch(q, motor) - stretch
         half = self.losses.play / 2
         self._anchor, self._lean, self._bent = other._anchor, np.clip(other._lean, -half, half), None
 

@@ -77,7 +77,8 @@ class MujocoScene:
         link_of: dict[str, str] = {}
         for link in moving_links(hand):
             parent = bodies[link.parent] if link.parent is not None else spec.worldbody
-            bodies[link.name] = body = parent.add_body(name=link.name, gravcomp=1.0)
+            # of a name of its own: that of an MJCF is MuJoCo's own "world"
+            bodies[link.name] = body = parent.add_body(name=f"link/{link.name}", gravcomp=1.0)
             body.pos, body.quat = link.placed[:3, 3], self._quaternion(link.placed[:3, :3])
             self._set_mass(body, max(link.mass, _LEAST_MASS), link.com, link.inertia)
             if link.joint is not None:

@@ -104,7 +104,7 @@ class Rig:
         scene.object_pose = (plan.position, plan.rotation)
         scene.hold_object(True)
         transmission.relax(plan.q)
-        slack = transmission.offset + transmission.J_a @ transmission.shape.excursion(plan.q)
+        slack = transmission.offset + transmission.length(plan.q)
         self.servo.place(slack)
         self.time = -_CLOSING  # time runs on while the object is grasped: a late camera looks back into it
         self.run(round(_CLOSING / step), lambda part: slack + part * (plan.motor - slack))

@@ -1,0 +1,50 @@
+"""Hands of other kinds in both engines: what is planned is what the simulated hand does."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from made_hands import write_hand
+from other_hands import main
+
+from torch_ekm.description import load_hand
+from torch_ekm.simulation import SimulatedHand
+
+KINDS = {"tendon_springs": 0.05, "not_round": 0.05, "four_bar": 0.25, "idle": 0.05}
+"""And how much of the planned force may be missing: loops give way a little."""
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_planned_pinch_holds_as_planned(kind: str, engine: str, tmp_path: Path) -> None:
+    plant = SimulatedHand(load_hand(write_hand(kind, tmp_path)), "can", engine=engine)
+    seen = plant.reset(0)
+    hand, truth = plant.hand, seen.truth
+    assert truth is not None
+    assert truth.fingertip_force is not None
+    planned = np.linalg.norm(plant.plan.forces, axis=1)
+    np.testing.assert_allclose(truth.fingertip_force, planned, rtol=KINDS[kind])
+    np.testing.assert_allclose(truth.q, plant.plan.q, atol=0.05)
+    assert (seen.a.numpy() >= hand.actuator_lower - 1e-9).all()
+    if hand.loops is not None:
+        arms = np.linalg.norm(hand.loops.lengths.typical, axis=1)
+        assert np.abs(hand.loops.gap(truth.q.numpy()) / arms).max() < 0.02
+    moved = plant.command(torch.full((hand.n_a,), 0.02, dtype=torch.float64)).truth
+    assert moved is not None
+    assert moved.fingertip_force is not None
+    assert float((moved.fingertip_force - truth.fingertip_force).abs().max()) > 0.05
+    plant.close()
+
+
+def test_the_benchmark_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_hand("metres", tmp_path)
+    (tmp_path / "broken.urdf").write_text("<robot/>")
+    main([str(tmp_path)])
+    assert capsys.readouterr().out.splitlines()[-1] == "hands 2, read 1, pinched 1, turned 1, lost 0"

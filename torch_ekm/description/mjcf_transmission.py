@@ -1,0 +1,327 @@
+"""The transmission that an MJCF describes, as the tables of a transmission file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from .._extras import require
+from ..exceptions import DescriptionError
+from ..typing import Array
+from ._toml import TODO
+from .mjcf_tendons import RoutedTendons
+from .urdf import UrdfModel
+
+_NARROW = (
+    0.2  # a limited tendon is a coupling if it may move by less than this share of what its joints allow
+)
+_DRAWN = 200  # postures at which the length of a spatial tendon is looked at
+_OFF = 1e-9  # [rad] or [m] by which springs at rest may miss an equality
+_Tie = tuple[str, Array, float]
+"""Name of a coupling, its row ``(n_q,)`` and its value."""
+
+
+class MjcfTransmission:
+    """Reads ``[joints]``, ``[[actuators]]``, ``[[couplings]]``, ``[[tendon_springs]]`` and ``[[loops]]``.
+
+    Joints that are not of the hand stay where MuJoCo counts them from.
+
+    Args:
+        urdf: the hand.
+        model: MuJoCo's.
+        names: of MuJoCo's joints, by their numbers; those of the hand in the order of q.
+        frames: of MuJoCo's bodies: the link of each, and its frame in the link's.
+        held: links that another joint than a hinge carries, which is held.
+        whole: nothing of the file is left out.
+        note: takes what is assumed, and of what.
+    """
+
+    def __init__(
+        self,
+        urdf: UrdfModel,
+        model: Any,
+        names: dict[int, str],
+        frames: dict[int, tuple[str, Array]],
+        held: set[str],
+        whole: bool,
+        note: Callable[[str, str], None],
+    ) -> None:
+        self.path, self.urdf, self.model, self.whole, self._note = urdf.path, urdf, model, whole, note
+        self._mj = require("mujoco")
+        self.names, self.hinges, self._frames, self._held = names, list(names), frames, held
+        limited = [bool(model.jnt_limited[j]) for j in self.hinges]
+        ends = np.where(np.array(limited)[:, None], model.jnt_range[self.hinges], [-np.inf, np.inf])
+        self.lower, self.upper = ends.T
+        self._drives: list[Array] = []
+        self._loops: list[dict[str, Any]] = []
+        self._used: set[int] = set()
+        """Tendons that something pulls or ties."""
+
+    def tables(self) -> dict[str, Any]:
+        """All of them.
+
+        Raises:
+            DescriptionError: a weld of a part that moves, an equality of tendons that is not linear.
+        """
+        found = [self._actuator(k) for k in range(self.model.nu)]
+        actuators = [actuator for actuator in found if actuator is not None]
+        couplings = list(self._equalities())
+        for note, tie in self._tendon_couplings():
+            rows = [*self._drives, *(row for _, row, _ in couplings), tie[1]]
+            if np.linalg.matrix_rank(rows) == len(rows):
+                couplings.append(tie)
+            else:
+                note = "tendons that tie joints with motors of their own are left out"
+            self._note(note, tie[0])
+        rests, couplings = self._rests(couplings)
+        joints = {
+            self.names[j]: {
+                "spring": float(self.model.jnt_stiffness[j]),
+                "rest": float(rests[k]),
+                "friction": float(self.model.dof_frictionloss[self.model.jnt_dofadr[j]]),
+            }
+            for k, j in enumerate(self.hinges)
+        }
+        tied = [{"name": label, "joints": self._named(row)} for label, row, _ in couplings]
+        tables = {"joints": joints, "actuators": actuators, "couplings": tied}
+        return tables | {"tendon_springs": list(self._springs()), "loops": self._loops}
+
+    def _rests(self, couplings: list[_Tie]) -> tuple[Array, list[_Tie]]:
+        """Where springs are slack, joints without a spring at angles that obey the couplings; and these. One
+        that springs at rest do not obey is a loop with a value of its own."""
+        rests = self._rest()
+        if not couplings:
+            return rests, couplings
+        C, length = np.array([row for _, row, _ in couplings]), np.array([value for *_, value in couplings])
+        loose = np.array([self.model.jnt_stiffness[j] == 0 for j in self.hinges])
+        rests[loose] += np.linalg.pinv(C[:, loose]) @ (length - C @ rests)
+        off = np.abs(length - C @ rests) > _OFF
+        for apart, (name, row, value) in zip(off, couplings, strict=True):
+            if apart:
+                self._loops.append({"name": name, "moment_arms": self._named(row), "value": value})
+        return rests, [one for apart, one in zip(off, couplings, strict=True) if not apart]
+
+    def _rest(self) -> Array:
+        return np.array([self.model.qpos_spring[self.model.jnt_qposadr[j]] for j in self.hinges])
+
+    # -- actuators ----------------------------------------------------------------------------------
+
+    def _actuator(self, k: int) -> dict[str, Any] | None:
+        """None: it drives no joint of the hand."""
+        model = self.model
+        name = model.actuator(k).name or f"actuator_{k}"
+        row, offset, gear, tendon = self._driven(k)
+        way = None if tendon is None or self._is_fixed(tendon) else tendon
+        if not row.any():
+            if self.whole:
+                self._note("actuators that drive no joint of the hand are left out", name)
+            return None
+        length = self._span(row) + offset if way is None else self._way_span(way, gear)
+        gain, bias = float(model.actuator_gainprm[k, 0]), float(model.actuator_biasprm[k, 1])
+        table: dict[str, Any] = {"name": name}
+        low, high = model.actuator_forcerange[k] if model.actuator_forcelimited[k] else (-1.0, 1.0)
+        pulls_back = high <= 0  # MuJoCo's tendons pull where they shorten; here where `a` grows
+        if bias < 0 < gain:
+            if model.actuator_ctrllimited[k]:
+                length = gain / -bias * model.actuator_ctrlrange[k]
+            table["stiffness"] = -bias
+        else:
+            self._note("actuators without position control are taken as rigid, over their whole stroke", name)
+        sign = -1.0 if pulls_back else 1.0
+        table["range"] = sorted((sign * length).tolist()) if np.isfinite(length).all() else [TODO, TODO]
+        if way is None:
+            table |= {"offset": sign * offset, "moment_arms": self._named(sign * row)}
+        else:
+            table["mjcf_tendons"] = {self._tendon_name(way): sign * gear}
+        table["tendon"] = bool(pulls_back or low >= 0)
+        if tendon is not None and np.abs(row).max() < 0.1:
+            told = "plants and models count in its largest arm"
+            self._note(f"these count in the length of their tendon, not in rad; {told}", name)
+        self._drives.append(row)
+        return table
+
+    def _driven(self, k: int) -> tuple[Array, float, float, int | None]:
+        """Moment arms ``(n_q,)`` and length at zero angles of an actuator, its gear and its tendon.
+
+        No arms: it drives nothing of the hand, or is of another kind.
+        """
+        model, kinds = self.model, self._mj.mjtTrn
+        gear, target = float(model.actuator_gear[k, 0]), int(model.actuator_trnid[k, 0])
+        kind = int(model.actuator_trntype[k])
+        if kind == kinds.mjTRN_TENDON:
+            self._used.add(target)
+            row, offset = self._tendon(target)
+            return gear * row, gear * offset, gear, target
+        if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
+            return gear * self._unit(target), 0.0, gear, None
+        return np.zeros(len(self.hinges)), 0.0, gear, None
+
+    def _unit(self, joint: int) -> Array:
+        """1 at a joint, ``(n_q,)``; zeros: it is not of the hand."""
+        return np.array([float(joint == j) for j in self.hinges])
+
+    def _start(self, joint: int) -> float:
+        """Where MuJoCo counts a joint from, and holds one that is not of the hand."""
+        return float(self.model.qpos0[self.model.jnt_qposadr[joint]])
+
+    # -- tendons ------------------------------------------------------------------------------------
+
+    def _tendon_name(self, t: int) -> str:
+        return self.model.tendon(t).name or f"tendon_{t}"
+
+    def _parts(self, t: int) -> range:
+        return range(self.model.tendon_adr[t], self.model.tendon_adr[t] + self.model.tendon_num[t])
+
+    def _is_fixed(self, t: int) -> bool:
+        joint = self._mj.mjtWrap.mjWRAP_JOINT
+        return all(int(self.model.wrap_type[w]) == joint for w in self._parts(t))
+
+    def _tendon(self, t: int) -> tuple[Array, float]:
+        """Moment arms ``(n_q,)`` and length at zero angles: exact for fixed tendons, else at rest."""
+        model = self.model
+        if not self._is_fixed(t):
+            rest = self._rest()
+            length, J = RoutedTendons(model, [{t: 1.0}], self.hinges)(rest)
+            return J[0], float(length[0] - J[0] @ rest)
+        row, held = np.zeros(len(self.hinges)), 0.0
+        for w in self._parts(t):
+            unit = self._unit(int(model.wrap_objid[w]))
+            row += model.wrap_prm[w] * unit
+            held += 0.0 if unit.any() else model.wrap_prm[w] * self._start(int(model.wrap_objid[w]))
+        return row, float(held)
+
+    def _way_span(self, t: int, gear: float) -> Array:
+        """Least and largest length of a tendon within the joints' limits ``(2,)``, as far as seen."""
+        low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
+        draw, routed = np.random.default_rng(0), RoutedTendons(self.model, [{t: gear}], self.hinges)
+        lengths = [routed(q)[0][0] for q in (low, high, *draw.uniform(low, high, (_DRAWN, len(low))))]
+        return np.array([min(lengths), max(lengths)])
+
+    def _springs(self) -> Iterator[dict[str, Any]]:
+        """Springs over tendons."""
+        for t in np.flatnonzero(self.model.tendon_stiffness > 0).tolist():
+            row, offset = self._tendon(t)
+            if not row.any():
+                continue
+            table: dict[str, Any] = {"name": self._tendon_name(t)}
+            ends = self.model.tendon_lengthspring[t]
+            if self._is_fixed(t):
+                table["moment_arms"], ends = self._named(row), ends - offset
+            else:
+                table["mjcf_tendons"] = {self._tendon_name(t): 1.0}
+            yield table | {"stiffness": float(self.model.tendon_stiffness[t]), "slack": ends.tolist()}
+
+    def _tendon_couplings(self) -> Iterator[tuple[str, _Tie]]:
+        """Tendons that nobody pulls: those that can hardly move tie their joints; with notes."""
+        model = self.model
+        for t in range(model.ntendon):
+            if t in self._used or not model.tendon_limited[t]:
+                continue
+            row, offset = self._tendon(t)
+            if not row.any():
+                continue
+            shortest, longest = self._span(row)
+            low, high = model.tendon_range[t].tolist()
+            if high - low < _NARROW * (longest - shortest) and (row != 0).sum() > 1:
+                tie = self._tendon_name(t), row, (low + high) / 2 - offset
+                yield "tendons that can hardly move tie their joints", tie
+            else:
+                self._note("limits of tendons are left out", self._tendon_name(t))
+
+    # -- equalities ---------------------------------------------------------------------------------
+
+    def _equalities(self) -> Iterator[_Tie]:
+        """``C q = c``, one row for each equality that is linear; the others are loops."""
+        model, kinds = self.model, self._mj.mjtEq
+        for e in np.flatnonzero(model.eq_active0).tolist():
+            kind, name = int(model.eq_type[e]), model.equality(e).name or f"equality_{e}"
+            first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+            if kind != kinds.mjEQ_JOINT and kind != kinds.mjEQ_TENDON:
+                self._pinned(e, kind, name)
+                continue
+            follows = second >= 0 and (kind == kinds.mjEQ_TENDON or second in self.hinges)
+            if follows and np.any(model.eq_data[e, 2:5]):
+                self._curve(e, kind, name)
+                continue
+            constant, slope = model.eq_data[e, :2].tolist()
+            tied = {first: 1.0} | ({second: -slope} if second >= 0 else {})
+            if kind == kinds.mjEQ_TENDON:
+                self._used |= set(tied)
+                if not all(map(self._is_fixed, tied)):
+                    self._tie_tendons(name, tied, constant)
+                    continue
+            row, value = np.zeros(len(self.hinges)), constant
+            for which, weight in tied.items():
+                one, start = self._tied(kind, which)
+                row, value = row + weight * one, value + weight * start
+            if row.any():
+                yield name, row, value
+
+    def _tied(self, kind: int, which: int) -> tuple[Array, float]:
+        """The row of a joint or tendon under an equality, and its value where MuJoCo counts from."""
+        if kind == self._mj.mjtEq.mjEQ_JOINT:
+            row = self._unit(which)
+            return row, self._start(which) if row.any() else 0.0
+        row, offset = self._tendon(which)
+        return row, float(self.model.tendon_length0[which]) - offset
+
+    def _tie_tendons(self, name: str, tied: dict[int, float], constant: float) -> None:
+        """Tendons on their own ways."""
+        if not any(self._tendon(t)[0].any() for t in tied):
+            return
+        value = constant + sum(weight * self.model.tendon_length0[t] for t, weight in tied.items())
+        weights = {self._tendon_name(t): weight for t, weight in tied.items()}
+        self._loops.append({"name": name, "mjcf_tendons": weights, "value": float(value)})
+
+    def _pinned(self, e: int, kind: int, name: str) -> None:
+        """Points of two links, where MuJoCo pins them; what the hand does not move is left out."""
+        model, links, points = self.model, [], []
+        of_sites = int(model.eq_objtype[e]) == self._mj.mjtObj.mjOBJ_SITE
+        for k, which in enumerate((int(model.eq_obj1id[e]), int(model.eq_obj2id[e]))):
+            body = int(model.site_bodyid[which]) if of_sites else which
+            point = model.site_pos[which] if of_sites else model.eq_data[e, 3 * k : 3 * k + 3]
+            link, frame = self._frames.get(body, ("", np.eye(4)))
+            links.append(link)
+            points.append((frame[:3, :3] @ point + frame[:3, 3]).tolist())
+        first, second = ({joint.child: joint.kind for joint in self.urdf.joints_to(link)} for link in links)
+        between = first.keys() ^ second.keys()
+        if all((first | second)[link] == "fixed" for link in between):
+            return  # what carries the hand, or the rest of the robot
+        if kind != self._mj.mjtEq.mjEQ_CONNECT:
+            problem = f"equality '{name}' welds bodies: only joints, tendons and points are tied"
+            raise DescriptionError(self.path, problem)
+        if not set(links) <= {link.name for link in self.urdf.links}:
+            self._note("points that are pinned to what is not of the hand are free", name)
+            return
+        if self._held & between:
+            self._note("loops that close through joints that are held are left out", name)
+            return
+        self._loops.append({"name": name, "links": links, "points": points})
+
+    def _curve(self, e: int, kind: int, name: str) -> None:
+        """A joint that follows another along a polynomial of up to the fourth power."""
+        model = self.model
+        first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        if kind != self._mj.mjtEq.mjEQ_JOINT:
+            raise DescriptionError(self.path, f"equality '{name}' of tendons is not linear")
+        start, other = self._start(first), self._start(second)
+        curve = np.polynomial.Polynomial(model.eq_data[e, :5])(np.polynomial.Polynomial([-other, 1.0]))
+        arms = {self.names[second]: (-curve.deriv().coef).tolist()}
+        if first in self.hinges:
+            arms, value = {self.names[first]: 1.0} | arms, start + float(curve(0.0))
+        else:  # it is held where it starts
+            value = float(curve(0.0))
+        self._loops.append({"name": name, "moment_arms": arms, "value": value})
+
+    # -- rows ---------------------------------------------------------------------------------------
+
+    def _span(self, row: Array) -> Array:
+        """Least and largest ``row q`` within the joints' limits ``(2,)``."""
+        pulled = row != 0
+        ends = row[pulled] * np.array([self.lower, self.upper])[:, pulled]
+        return np.array([ends.min(axis=0).sum(), ends.max(axis=0).sum()])
+
+    def _named(self, row: Array) -> dict[str, float]:
+        return {self.names[j]: float(row[k]) for k, j in enumerate(self.hinges) if row[k] != 0}
