@@ -91,7 +91,14 @@ def test_an_encoder_that_is_wrong_in_one_look_moves_nothing_far_and_teaches_noth
     plant = slipping(held, glitch)
     _, done = turn(held, plant, learns=learns, knowledge=knowledge)
     if look != 3:  # the last look at the motion, whose pose is in doubt: then it ends by the encoder
-        assert done.reason in (Reason.REACHED, Reason.GIVEN_UP, Reason.UNSTABLE_GRASP)
+        blameless = (
+            Reason.REACHED,
+            Reason.GIVEN_UP,
+            Reason.UNSTABLE_GRASP,
+            Reason.STALLED,
+            Reason.ACTUATOR_LIMITS,
+        )
+        assert done.reason in blameless
     assert max(float(v.abs().max()) for v in plant.given) < 10 * DEG
     assert float(knowledge.servo.bias.abs().max()) < 0.05 * DEG
 

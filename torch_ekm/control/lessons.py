@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
 
-_SLIPS, _OF_WAY = 3.0, 0.15  # noises, and share of the way, from which an object is thought to slide
+_SLIPS, _OF_WAY = 3.0, 0.15  # noises, and share of the way of f + g, from which an object is thought to slide
 _OF_IT, _WRONG = 0.25, 3.0  # share of what a finger bears that is no surprise; deviations that are one
 
 
@@ -77,7 +77,8 @@ class Lessons:
         off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
         if decision.turns:
             self._knowledge.error.see(off, way)
-            if float(off.norm()) > _SLIPS * NOISE.rotation + _OF_WAY * float(way.norm()):
+            of_way = NOISE.described if self._controller.enhanced is None else _OF_WAY
+            if float(off.norm()) > _SLIPS * NOISE.rotation + of_way * float(way.norm()):
                 self._knowledge.error.slid()
                 self._controller.tighter = float(self._knowledge.error.tighter)
 

@@ -132,8 +132,10 @@ class Consistency:
         the hand as described predicts: what is learned of it changes meanwhile."""
         n_q, w = self.hand.n_q, expected.moved.numpy()
         came = seen.state.minus(before.state)
-        e = self.hand.actuation_jacobian @ (expected.described - came).numpy()[:n_q]
-        if not any(self._bears(one.linearization) for one in expected.pieces):
+        J_a = self.hand.lengths.jacobian(before.q.numpy(), self.hand.actuation_jacobian)
+        e = J_a @ (expected.described - came).numpy()[:n_q]
+        # where links bear or pads are off the object, joints do not do what is described
+        if self.on_surface(before) and not any(self._bears(one.linearization) for one in expected.pieces):
             self._sums += np.stack([np.ones_like(w), w, w * w, e, w * e, e * e])
         n, w, ww, e, we, ee = self._sums
         beta, std, variance = 0 * n, 0 * n, np.full_like(n, _REST_STD**2)
@@ -179,10 +181,8 @@ class Consistency:
         return found and f"{found}: check these sensors, and the pose"
 
     def _stretch(self, seen: Observation) -> Array:
-        """``a - a_0 - J_a q`` [rad]."""
-        hand = self.hand
-        stretch: Array = seen.a.numpy() - hand.actuator_offset - hand.actuation_jacobian @ seen.q.numpy()
-        return stretch
+        """``a - a_0 - l(q)`` [rad]."""
+        return seen.a.numpy() - self.hand.unloaded(seen.q.numpy())
 
     def _offset(self, seen: Observation) -> str:
         """All joints together are off by an angle that brings the pads back to the object's surface."""
