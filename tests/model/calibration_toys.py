@@ -44,7 +44,7 @@ class Toy:
         state = play.at(torch.zeros(3, dtype=F64))
         for k in range(steps + 1):
             if k:
-                goal = self.at.a + torch.from_numpy(draw.uniform(-size, size, 3))
+                goal = self.at.a + torch.from_numpy(draw.uniform(-size, size, 3)) / self.toy.unit
                 moved, state = play.advance(state, goal - motor)
                 motor, at = goal, self.solver.moved(at, at.a + moved)
             normal = self.solver.forces(at).normal if force else None

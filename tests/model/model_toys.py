@@ -160,6 +160,11 @@ class Toy:
     lam: torch.Tensor
     a: torch.Tensor
 
+    @property
+    def unit(self):
+        """What 1 is of each motor in the toy's own unit, metres of its tendon."""
+        return torch.tensor([actuator.unit for actuator in self.model.hand.actuators], dtype=F64)
+
     def solver(self, **options):
         from equilibrium import EquilibriumSolver
 
@@ -202,7 +207,10 @@ def build(
     options=None,
     tendon=True,
 ) -> Toy:
-    """Fingers at q whose ball tips touch an object with the given normals; at rest with the given grip."""
+    """Fingers at q whose ball tips touch an object with the given normals; at rest with the given grip.
+
+    ``lam`` is in the unit of ``J_a``, as ``stiffness`` is.
+    """
     from torch_ekm.contact.contact_kinematics import constraint_matrix
     from torch_ekm.kinematics import GraspState
     from torch_ekm.model import KinematicModel
@@ -252,7 +260,8 @@ def build(
     Zp = model.reduction.pose_basis
     mu = wish + torch.linalg.pinv(Zp.T @ G) @ (Zp.T @ (V_p - G @ wish))
     assert float((Zp.T @ (G @ mu - V_p)).abs().max()) < 1e-10
-    lam = torch.as_tensor(lam, dtype=F64).expand(len(np.atleast_2d(J_a))).clone()
+    unit = torch.tensor([actuator.unit for actuator in model.hand.actuators], dtype=F64)
+    lam = torch.as_tensor(lam, dtype=F64) * unit
     torque = A[:, :n_q].T @ mu + model.reduction.actuation.T @ lam
     rest = q + torque / torch.as_tensor(np.asarray(springs, dtype=float))
     model = make(rest.numpy())

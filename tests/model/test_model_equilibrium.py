@@ -19,7 +19,7 @@ def test_pinned_equilibria_minimise_the_energy():
     scipy_optimize = pytest.importorskip("scipy.optimize")
     toy = planar_two_finger(pinned=True)
     solver, start = toy.solver(), toy.equilibrium()
-    a = start.a + torch.tensor([0.4e-3, -0.2e-3], dtype=F64)
+    a = start.a + torch.tensor([0.4e-3, -0.2e-3], dtype=F64) / toy.unit
     found = solver.move(start, a)
     model = toy.model
     kin, links = model.kinematics, [model.link_names.index(name) for name in toy.contacts.link]
@@ -42,7 +42,7 @@ def test_pinned_equilibria_minimise_the_energy():
         T = kin(q).transforms[links]
         finger = T[:, :3, 3] + (T[:, :3, :3] @ on_finger[..., None])[..., 0]
         closing = (finger - o - on_object @ R.mT)[:, :2].flatten() / 0.03
-        tendons = (model.reduction.actuation @ q - a) / 0.009
+        tendons = model.reduction.actuation @ q - a
         return torch.cat([closing, tendons]).numpy()
 
     x0 = np.concatenate([toy.state.q.numpy(), np.zeros(3)])
@@ -60,7 +60,7 @@ def test_pinned_equilibria_minimise_the_energy():
 def test_the_solution_satisfies_every_equation(make):
     toy = make()
     solver, start = toy.solver(), toy.equilibrium()
-    a = start.a + 0.3e-3 * torch.linspace(-1, 1, len(start.a), dtype=F64)
+    a = start.a + 0.3e-3 * torch.linspace(-1, 1, len(start.a), dtype=F64) / toy.unit
     end = solver.move(start, a)
     assert torch.allclose(solver.actuators(end.state), a, atol=1e-12)
     contacts = solver.surfaces(end.state.q, end.state.position, end.state.rotation)
@@ -77,22 +77,22 @@ def test_the_solution_satisfies_every_equation(make):
 
 def test_planar_motion_can_be_undone_and_spatial_rolling_depends_on_the_path():
     def loop(toy, size):
-        solver, at = toy.solver(max_step=2e-5), toy.equilibrium()
+        solver, at = toy.solver(max_step=2e-3), toy.equilibrium()
         n_a = len(at.a)
         one, two = size * torch.eye(n_a, dtype=F64)[:2]
         for step in (one, two, -one, -two):
             at = solver.move(at, at.a + step)
         return float((at.state.minus(toy.state)).abs().max())
 
-    assert loop(planar_two_finger(), 6e-5) < 1e-8
-    assert loop(planar_two_finger(pinned=True), 6e-5) < 1e-8
-    assert loop(soft_two_finger(), 1e-4) > 1e-5
+    assert loop(planar_two_finger(), 6e-3) < 1e-8
+    assert loop(planar_two_finger(pinned=True), 6e-3) < 1e-8
+    assert loop(soft_two_finger(), 1e-2) > 1e-5
 
 
 def test_midpoint_steps_converge_with_second_order():
     toy = three_finger()
     start = toy.equilibrium()
-    a = start.a + torch.tensor([3e-4, -1e-4, 2e-4], dtype=F64)
+    a = start.a + torch.tensor([3e-4, -1e-4, 2e-4], dtype=F64) / toy.unit
     ends = []
     for step in (1.5e-4, 0.75e-4, 2.5e-5):
         ends.append(toy.solver(max_step=step).move(start, a).state)
@@ -120,7 +120,7 @@ def test_grip_reaches_the_wished_normal_forces():
 def test_beyond_the_fold_there_is_no_equilibrium():
     toy = planar_two_finger()
     with pytest.raises(EquilibriumError, match="% of the way"):
-        toy.solver().move(toy.equilibrium(), toy.equilibrium().a + 0.05)
+        toy.solver().move(toy.equilibrium(), toy.equilibrium().a + 5)
 
 
 def test_a_flat_finger_is_refused():

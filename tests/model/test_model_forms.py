@@ -26,7 +26,7 @@ GRASPS = {
 
 
 def matrices(toy):
-    """D, A, B in scaled coordinates (translations in units of 30 mm, tendons of 9 mm)."""
+    """D, A, B in scaled coordinates (translations in units of 30 mm)."""
     model, state = toy.model, toy.state
     kin = model.contact_kinematics(state, toy.contacts)
     forces = toy.forces()
@@ -36,7 +36,7 @@ def matrices(toy):
     D[n_q:, n_q:] += gravity_hessian(model.weight, model.com)
     S = model.reduction.scaled_basis
     A = constraint_matrix(kin) @ S / 0.03
-    B = model.reduction.actuation @ S[:n_q] / 0.009
+    B = model.reduction.actuation @ S[:n_q]
     return S.mT @ D @ S, A, B, S
 
 
