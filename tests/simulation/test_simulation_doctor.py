@@ -59,3 +59,8 @@ def test_an_object_that_is_too_wide_is_told_how_wide_it_may_be():
     width = re.match(r"an object ([\d.]+) mm wide, not 90.0 \(as far as geometry goes\)", change)
     assert width is not None
     assert 30 < float(width[1]) < 88
+
+
+def test_a_pinch_that_holds_in_the_middle_needs_no_other_figure():
+    (change,) = smallest_changes(HAND, CAN, PlantConfig(), PlantParameters()).changes
+    assert "spread = 0" in change

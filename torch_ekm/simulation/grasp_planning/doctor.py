@@ -30,6 +30,7 @@ _AT_A_STOP = 1e-3  # [rad] from the end of the planner's range
 _STEPS = 60  # of a descent
 _FIRST = ("force", "width")  # their decrease is tried whatever the slope says
 _LIKELY = ("range", "all springs")  # so is what lowers the cost of these
+_CENTRED = "fingertips centred on the object (spread = 0), as it is otherwise"
 _TOLD = 3  # changes that are told
 
 
@@ -100,7 +101,13 @@ def smallest_changes(
     request = PinchRequest(hand.pinch_force if config.pinch_force is None else config.pinch_force)
     reach = solve(BorneProblem(problem), request)
     case = Case(hand, obj, request, parameters, problem if reach.holds else BorneProblem(problem))
-    starts = [reach.x] if case.borne else [reach.x, solve(problem, request).x]
+    q = problem.geometry(reach.x[None]).q[0]
+    starts = [reach.x]
+    if not case.borne:
+        best = solve(problem, request)
+        if best.holds and across_axis(problem, best):
+            return Cure([_CENTRED], q)
+        starts.append(best.x)
     held: list[tuple[float, int, Change, Array]] = []
     for n, change in enumerate(_steepest(case, starts)):
         if time.process_time() > end - _REFINING * seconds:
@@ -120,7 +127,7 @@ def smallest_changes(
         far = " (as far as geometry goes)" if case.borne else ""
         told[change.kind] = change.text(change.side * high) + far
         least.append((high, told[change.kind]))
-    return Cure([text for _, text in sorted(least)], problem.geometry(reach.x[None]).q[0])
+    return Cure([text for _, text in sorted(least)], q)
 
 
 def _with(case: Case, change: Change, starts: list[Array]) -> tuple[float, Array] | None:
