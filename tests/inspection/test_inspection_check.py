@@ -17,6 +17,7 @@ from torch_ekm.description import list_hands, load_hand, load_object
 from torch_ekm.exceptions import DescriptionError, EquilibriumError, GraspError
 from torch_ekm.inspection import check as module
 from torch_ekm.inspection.check import check_hand
+from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 from torch_ekm.simulation.grasp_planning import pinch
 from torch_ekm.simulation.grasp_planning.pinch import pinch_problem
@@ -73,7 +74,6 @@ FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and t
     "pad in a box": (0, _CAPSULE, _BOX, "pad 'left'", "warning", "a <collision> box, whose edges touch"),
     "limits": (0, 'upper="1.5"', 'upper="0.02"', "limits", "error", "joint '.*_[01]': no posture within"),
     "no limits": (0, 'left_0" type="revolute"', 'left_0" type="continuous"', "limits", "error", "left_0"),
-    "wide limits": (0, '"-0.5" upper="1.5"', '"-3" upper="3"', "limits", "warning", "left_0.*344 deg"),
     "axis": (0, '<axis xyz="0 0 -1"/>', '<axis xyz="0 0.1 -1"/>', "hand's files", "error", "planar_normal"),
     "never taut": (1, SPRING + "0", SPRING + "160", "tendon 'left'", "error", "slack"),
     "late": (1, SPRING + "0", SPRING + "100", "tendon 'left'", "warning", "from 100 deg"),
@@ -90,7 +90,6 @@ NO_PINCH = ("never taut", "rigid")
 @pytest.mark.usefixtures("brief")
 @pytest.mark.parametrize("fault", list(FAULTS))
 def test_each_fault_has_its_row(fault, files, monkeypatch):
-    monkeypatch.setattr(module, "_GENTLER", ())  # two tests below look at gentler pinches
     if fault in NO_PINCH:
         monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "not tried")])
     which, old, new, name, state, text = FAULTS[fault]
@@ -151,10 +150,10 @@ def test_a_grasp_width_that_is_not_the_objects_is_named():
 
 
 @pytest.mark.usefixtures("brief")
-def test_where_the_files_have_a_fault_no_other_force_is_tried(files, monkeypatch):
+def test_where_the_files_have_a_fault_no_other_figure_is_tried(files, monkeypatch):
     tried = []
-    monkeypatch.setattr(module, "_gentler", lambda *of: tried.append(of) or ())
-    monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "not tried")])
+    monkeypatch.setattr(module, "_cured", lambda *of: tried.append(of) or ())
+    monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "planner")])
     urdf, transmission = files
     assert "collision shapes" not in {row.name for row in check_hand(str(urdf), "can")}
     assert len(tried) == 1
@@ -239,34 +238,24 @@ def test_a_pinch_that_turns_little_is_told(monkeypatch):
 
 
 @pytest.mark.usefixtures("brief")
-def test_limits_that_leave_no_pinch_are_told_with_the_angle_that_it_takes(monkeypatch):
-    """Postures face to face exist, so that the row on limits is ok; none is in balance."""
-    lower, upper = HAND.joint_lower.copy(), HAND.joint_upper.copy()
-    lower[0], upper[0], upper[1] = -0.5, 0.0, 0.2
-    hand = dataclasses.replace(HAND, joint_lower=lower, joint_upper=upper)
-    monkeypatch.setattr(module, "load_hand", lambda _: hand)
-    monkeypatch.setattr(module, "_GENTLER", (4.0,))
-    left = dataclasses.replace(hand.actuators[0], lower=-0.5)
-    hand = dataclasses.replace(hand, actuators=(left, *hand.actuators[1:]))
-    rows = {row.name: row for row in check_hand("mine")}
-    assert rows["limits"].state == "ok"
-    angle = re.search(r"joint 'left_1' \(0 to 11 deg\) at (\d+) deg", rows["pinch"].found)
-    assert angle is not None
-    assert 12 < int(angle[1]) < 57
-    assert "no sound pinch with 4 N" in rows["pinch force"].found
-
-
-@pytest.mark.usefixtures("brief")
 def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monkeypatch):
     hand = dataclasses.replace(HAND, spring_stiffness=HAND.spring_stiffness / 4)
     monkeypatch.setattr(module, "load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine", "can")}
-    assert rows["pinch"].state == "error"
-    assert "sound at 2 N" in rows["pinch force"].found
-    assert "pinch_force = 2 under [hand]" in rows["pinch force"].remedy
-    gentle = dataclasses.replace(hand, pinch_force=2.0)
+    assert rows["limits"].state == "ok"
+    assert "the fingertips reach it; torque is to blame: joint" in rows["pinch"].found
+    force = re.search(r"a pinch_force of ([\d.]+) N", rows["smallest change"].found)
+    assert force is not None
+    gentle = dataclasses.replace(hand, pinch_force=float(force[1]))
     rows = {row.name: row for row in module._pinch(gentle, load_object("can"), None, PlantConfig())}
     assert rows["pinch"].state == "ok"
+
+
+def test_a_planned_pinch_that_is_lost_is_told_with_forces_and_distance(monkeypatch):
+    monkeypatch.setattr(SimulatedHand, "status", PlantStatus.LOST)
+    (row,) = module._pinch(HAND, load_object("can"), None, PlantConfig())
+    assert row.state == "error"
+    assert re.search(r"s after closing: forces \[N\] left \d.*, right \d.*, the object \d+ mm off", row.found)
 
 
 @pytest.mark.usefixtures("brief")

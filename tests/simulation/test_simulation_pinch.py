@@ -108,7 +108,7 @@ def test_a_pinch_keeps_the_actuators_in_their_ranges(monkeypatch):
         assert lower < plan.motor[0] < upper
     problem = with_range(149 * DEG, 150 * DEG)
     monkeypatch.setattr(pinch, "_GUESSES", 1)  # the others fail too
-    with pytest.raises(EquilibriumError, match=r"actuator 'left' \(149 to 150 deg\) at \d+ deg"):
+    with pytest.raises(EquilibriumError, match=r"actuator 'left' \(149 deg to 150 deg\) at \d+ deg"):
         plan_pinch(problem, PinchRequest())
 
 
@@ -187,8 +187,8 @@ def test_an_object_that_no_pinch_holds_is_refused_once(tmp_path, monkeypatch):
     )
     monkeypatch.setattr(pinch, "_GUESSES", 1)  # the others fail too
     plant = SimulatedHand("icub_right", str(tmp_path / "bead.urdf"), engine="mujoco")
-    descents, descend = [], pinch._descend
-    monkeypatch.setattr(pinch, "_descend", lambda *what, **how: descents.append(1) or descend(*what, **how))
+    descents, descend = [], pinch.descend
+    monkeypatch.setattr(pinch, "descend", lambda *what, **how: descents.append(1) or descend(*what, **how))
     with pytest.raises(EquilibriumError, match="too small: 4 mm, for pads 'index' and 'middle'"):
         plant.reset(0)
     assert (often := len(descents)) > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Iterator
@@ -16,11 +17,12 @@ from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
 from ..control import ClosedLoop, LookAndMoveController
 from ..description import ContactPad, HandDescription, ObjectDescription, Shape, load_hand, load_object
-from ..exceptions import EKMError, MissingExtraError
+from ..exceptions import EKMError, EquilibriumError, GraspError, MissingExtraError
 from ..kinematics import ActuationMap, HandKinematics, LinkPoses
 from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
 from ..rendering import make_scene, save_picture
-from ..simulation import PlantConfig, SimulatedHand
+from ..simulation import PlantConfig, SimulatedHand, preset
+from ..simulation.grasp_planning.doctor import Cure, smallest_changes
 from ..simulation.grasp_planning.pinch import pinch_problem
 from ..simulation.grasp_planning.requirements import direction_unmet, unmet
 from ..simulation.parameters import PlantParameters
@@ -47,7 +49,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     Args:
         hand: name or path, as :func:`load_hand` takes it.
         object: name or path, as :func:`load_object` takes it.
-        picture: file for a picture of the hand in the pinch, or open if there is none, with the pads'
+        picture: file for a picture of the hand in the pinch, or the one that fails, with the pads'
             directions (black) and the contact frames (red along the inward normal, tangents green and blue);
             the object, which hides them, is left out.
 
@@ -78,8 +80,11 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         if wrong := [row.name for row in pads if row.state == "error"]:
             first = f"first correct {', '.join(wrong)}"
             pinch = [row._replace(remedy=first) if row.state == "error" else row for row in pinch]
-        # another force cures no fault of the files, and takes minutes to try
-        return [*rows, *pinch, *(() if unfit else _gentler(description, obj))]
+        if unfit:  # no other figure cures a fault of the files
+            return [*rows, *pinch]
+        planned = all(row.name != "pinch" or "planner" not in row.found for row in pinch)
+        more = _gentler(description, obj) if planned else _cured(description, obj, picture)
+        return [*rows, *pinch, *more]
     return [*rows, *pinch, *_turn(description, obj), *_disturbed(description, obj)]
 
 
@@ -195,16 +200,32 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         return
     lacks = [lack for lack in unmet(problem) if not lack.part.startswith("pad '")]  # those have rows
     for lack in lacks:
-        state: State = "error" if lack.certain else "warning"
-        yield Check("limits", state, f"{lack.part}: {lack.problem}", lack.remedy)
+        yield Check("limits", "error", f"{lack.part}: {lack.problem}", lack.remedy)
     if not lacks:
         first, *others = (pad.name for pad in problem.pads)
         apart = f"{1e3 * obj.grasp_width:.0f} mm between them"
         yield Check("limits", "ok", f"wide enough: pad {first} opposes {' and '.join(others)}, {apart}")
 
 
+def _cured(hand: HandDescription, obj: ObjectDescription, picture: Path | None) -> Iterator[Check]:
+    """The smallest changes with which the planner finds a pinch; the picture shows the one that fails."""
+    cure = smallest_changes(hand, obj, PlantConfig(), PlantParameters())
+    yield _changes(cure)
+    if picture is not None:
+        with contextlib.suppress(EKMError, OSError):  # a row says so
+            _draw(hand, None, picture, cure.q)
+
+
+def _changes(cure: Cure) -> Check:
+    if not cure.changes:
+        found = "none found: no single figure makes the pinch hold, or not within the time for the search"
+        return Check("smallest change", "warning", found, "another object, or several figures at once")
+    found = f"the pinch holds with {'; or '.join(cure.changes)}"
+    return Check("smallest change", "warning", found, "any of these")
+
+
 def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
-    """Springs that are too soft for the usual force may bear a smaller one."""
+    """A pinch that is planned and yet not held may be so with a smaller force."""
     smaller = [force for force in _GENTLER if force < hand.pinch_force]
     for force in smaller:
         if not any(row.state == "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))):
@@ -238,17 +259,20 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
 
 def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """Experiments and examples have faults in the hand."""
-    failures = []
+    failures: list[EKMError] = []
     for seed in range(_DISTURBED):
         try:
             SimulatedHand(hand, obj, preset="nominal").reset(seed)
         except MissingExtraError:
             return
         except EKMError as error:
-            failures.append(str(error))
+            failures.append(error)
     found = f"{_DISTURBED - len(failures)} of {_DISTURBED} held with the usual faults"
     if failures:
-        remedy = "as the message says, or a smaller 'pinch_force' in [hand], stiffer springs, more friction"
+        remedy = "a smaller 'pinch_force' in [hand], stiffer springs, more friction"
+        if isinstance(failures[0], EquilibriumError):
+            cure = smallest_changes(hand, obj, PlantConfig(), preset("nominal"))
+            remedy = "; or ".join(cure.changes) or remedy
         yield Check("pinch, preset nominal", "warning", f"{found}; {failures[0]}", remedy)
     else:
         yield Check("pinch, preset nominal", "ok", found)
@@ -274,12 +298,24 @@ def _pinch(
         yield Check("pinch", "warning", f"not tried: {error}")
     except EKMError as error:
         what = "pinch" if seen is None else "model"
-        yield Check(what, "error", str(error), "see docs/reference/errors.md")
+        found = f"{error}{_lost(plant) if isinstance(error, GraspError) else ''}"
+        yield Check(what, "error", found, "see docs/reference/errors.md")
     if picture is not None:
         try:
             yield Check("picture", "ok", str(_draw(hand, lin, picture).resolve()))
         except (EKMError, OSError) as error:
             yield Check("picture", "warning", f"not drawn: {error}")
+
+
+def _lost(plant: SimulatedHand) -> str:
+    """What was left of the last pinch that did not hold, once the object was let go."""
+    seen = plant.observe()
+    assert seen.truth is not None
+    assert seen.truth.fingertip_force is not None
+    away = float(np.linalg.norm(seen.truth.position.numpy() - plant.plan.position))
+    named = zip(plant.hand.pads, seen.truth.fingertip_force.tolist(), strict=True)
+    forces = ", ".join(f"{pad.name} {force:.1f}" for pad, force in named if pad.name in plant.plan.pads)
+    return f"; {seen.time:.1f} s after closing: forces [N] {forces}, the object {1e3 * away:.0f} mm off"
 
 
 def _sides(hand: HandDescription, contacts: ContactSet, poses: LinkPoses) -> Iterator[Check]:
@@ -324,9 +360,11 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
         yield Check("tendons in the pinch", "warning", f"slack: {', '.join(slack)}", remedy)
 
 
-def _draw(hand: HandDescription, lin: Linearization | None, path: Path) -> Path:
+def _draw(hand: HandDescription, lin: Linearization | None, path: Path, failed: Array | None = None) -> Path:
     """The hand with a rod along each pad's direction and the axes of each contact frame."""
     rest = torch.from_numpy(hand.spring_rest.clip(hand.joint_lower, hand.joint_upper))
+    if failed is not None:
+        rest = torch.from_numpy(failed)
     q = rest if lin is None else lin.state.q
     scene = make_scene(hand, None, q[None].numpy(), None, None, np.array(hand.gravity))
     poses, rods = HandKinematics(hand)(q), []

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...description import HandDescription, ObjectDescription
@@ -20,20 +19,20 @@ from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import chain, make_transmission, true_object
 from ..parameters import PlantParameters
-from .graspable import half_extent
-from .pinch_problem import PinchGeometry, PinchProblem, PinchRequest, opposition
+from .blame import BorneProblem, blame_geometry, blame_torque
+from .pinch_problem import PinchProblem, PinchRequest, opposition
 from .requirements import require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _POSTURES = 4096  # random ones, of which the best are first guesses
 _GUESSES = 5  # first guesses that are tried before giving up
+_STEPS = 150  # of a descent
 _STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
 _UNDECIDED = 0.9  # of the largest eigenvalue: fingers on a circle bend about no common axis
 _NEAR_AN_AXIS = np.cos(np.radians(15))  # the iCub's fingers bend about y to within 5 deg
 _CLOSING_POSTURES = 9  # from open to closed, in which pads are asked which one opposes the others
-_WIDER = np.pi / 4  # [rad] by which limits are moved to see which ones are in the way
 _GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
-_INSIDE = 0.5e-3  # [m] of a link in the object
+_LITTLE = 0.1  # of the weight of torques: 1 mm of gap counts as 0.1 N m
 _BAD_COST = 100.0  # pads beside the object, or hand and object in one another
 
 
@@ -55,7 +54,7 @@ class PinchPlan:
     pads: tuple[str, ...]
 
 
-class _Solution(NamedTuple):
+class Solution(NamedTuple):
     x: Array
     violation: float
     """Largest of gap / 0.1 mm, force / 10 mN, moment / 0.2 mN m, joint torque / 1 mN m."""
@@ -81,19 +80,15 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
     Raises:
         EquilibriumError: no posture was found that holds the object as wanted, across its grasp axis.
     """
-    found = _solve(problem, request)
+    found = solve(problem, request)
     g = problem.geometry(found.x[None])
-    motor = problem.motors(g)[0]
     if not found.holds:
         raise EquilibriumError(
             "pinch planner",
             f"no posture within the limits holds '{problem.obj.name}' with {request.force:g} N",
-            pinch_hint(problem)
-            or _limits_hint(problem, request)
-            or _range_hint(problem, motor)
-            or _size_hint(problem, g),
+            pinch_hint(problem) or _blame(problem, request),
         )
-    if np.abs(g.facing).min() < _FACING:
+    if not across_axis(problem, found):
         raise EquilibriumError(
             "pinch planner",
             "the only pinch found holds the object across another axis than its 'grasp_axis'",
@@ -105,7 +100,7 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
         q=g.q[0],
         position=g.position[0],
         rotation=g.rotation[0],
-        motor=motor,
+        motor=problem.motors(g)[0],
         forces=g.force[0],
         points=g.point[0],
         normals=g.normal[0],
@@ -113,45 +108,71 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
     )
 
 
+def across_axis(problem: PinchProblem, found: Solution) -> bool:
+    """Whether the object is held across its grasp axis."""
+    return bool(np.abs(problem.geometry(found.x[None]).facing).min() >= _FACING)
+
+
 def exists(problem: PinchProblem, request: PinchRequest) -> bool:
     """Whether some posture holds the object as wanted."""
-    return _solve(problem, request).holds
+    return solve(problem, request).holds
 
 
-def _solve(problem: PinchProblem, request: PinchRequest) -> _Solution:
+def solve(problem: PinchProblem, request: PinchRequest) -> Solution:
     """The first good solution, or the best from all first guesses."""
-    best = _Solution(np.zeros(0), np.inf, np.inf, np.inf)
+    best = Solution(np.zeros(0), np.inf, np.inf, np.inf)
     for guess in _guesses(problem, request):
-        found = _descend(problem, request, guess, ranges=False)
+        found = descend(problem, request, guess, ranges=False)
         if found.violation <= 1 and found.outside > 0:
-            found = _descend(problem, request, found.x, ranges=True)
-        best = min(best, found, key=_Solution.rank)
+            found = descend(problem, request, found.x, ranges=True)
+        best = min(best, found, key=Solution.rank)
         if best.good:
             break
     return best
 
 
-def _descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: bool) -> _Solution:
-    low, high = problem.bounds()
-    descend = partial(
-        require("scipy.optimize").least_squares,
+def descend(
+    problem: PinchProblem, request: PinchRequest, guess: Array, ranges: bool, most: int = _STEPS
+) -> Solution:
+    """The nearest minimum to a first guess."""
+    x, cost = minimise(
         lambda x: problem.residuals(x[None], request, ranges)[0],
-        jac=lambda x: problem.jacobian(x, request, ranges),
-        bounds=(low, high),
+        lambda x: problem.jacobian(x, request, ranges),
+        problem.bounds(),
+        guess,
+        most,
+    )
+    g = problem.geometry(x[None])
+    violation = float(np.abs(problem.equations(request, g)[0]).max())
+    return Solution(x, violation, float(problem.outside(g).max(initial=-np.inf)), cost)
+
+
+def minimise(
+    residuals: Callable[[Array], Array],
+    jacobian: Callable[[Array], Array],
+    bounds: tuple[Array, Array],
+    guess: Array,
+    most: int,
+) -> tuple[Array, float]:
+    """Least squares within bounds, in so many steps at most: where, and half the sum."""
+    low, high = bounds
+    squares = partial(
+        require("scipy.optimize").least_squares,
+        residuals,
+        jac=jacobian,
+        bounds=bounds,
         x_scale="jac",
-        max_nfev=150,
+        max_nfev=most,
         ftol=1e-9,
         xtol=1e-9,
         gtol=1e-9,
     )
     start = np.clip(guess, low + 1e-9, high - 1e-9)
     try:
-        found = descend(start)
+        found = squares(start)
     except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
-        found = descend(0.999 * start + 0.0005 * (low + high))
-    g = problem.geometry(found.x[None])
-    violation = float(np.abs(problem.equations(request, g)[0]).max())
-    return _Solution(found.x, violation, float(problem.outside(g).max(initial=-np.inf)), found.cost)
+        found = squares(0.999 * start + 0.0005 * (low + high))
+    return found.x, float(found.cost)
 
 
 def pinch_hint(problem: PinchProblem) -> str:
@@ -159,53 +180,15 @@ def pinch_hint(problem: PinchProblem) -> str:
     return "; ".join(map(str, unmet(problem)))
 
 
-def _limits_hint(problem: PinchProblem, request: PinchRequest) -> str:
-    """Joints that a pinch would take beyond their limits; empty if wider limits give none either."""
-    hand = problem.hand
-    wider = replace(hand, joint_lower=hand.joint_lower - _WIDER, joint_upper=hand.joint_upper + _WIDER)
-    thumb, *fingers = (pad.name for pad in problem.pads)
-    freed = PinchProblem(wider, problem.obj, problem.transmission, thumb, tuple(fingers), problem.along)
-    found = _solve(freed, request)
-    at = found.x[: len(problem.moving)]
-    low, high = (edge[: len(at)] for edge in problem.bounds())
-    names = [hand.joint_names[joint] for joint in problem.moving]
-    beyond = _places(names, at, *problem.joint_range, (at < low) | (at > high))
-    if not (found.good and beyond):
-        return ""
-    return (
-        f"it takes joint {beyond}: let the limits run some degrees beyond that; else less "
-        "force, stiffer springs, another object"
-    )
-
-
-def _range_hint(problem: PinchProblem, motor: Array) -> str:
-    """Actuators that the best posture takes out of their ranges; empty if there is none."""
-    hand = problem.hand
-    low, high = hand.actuator_lower, hand.actuator_upper
-    out = problem.in_use & ((motor < low) | (motor > high))  # idle ones rest, give or take a rounding
-    beyond = _places(hand.actuator_names, motor, low, high, out)
-    remedy = "another range_deg, a smaller pinch_force, stiffer springs or another object"
-    return f"the best takes actuator {beyond}: {remedy}" if beyond else ""
-
-
-def _size_hint(problem: PinchProblem, g: PinchGeometry) -> str:
-    """What is wrong with the object's size, by the best posture."""
-    if (inside := -float(g.clearance.min())) > _INSIDE:
-        return f"it is too wide: some link would be {1e3 * inside:.0f} mm inside it"
-    length, pads = 2 * half_extent(problem.obj, problem.axes[:, 0]), problem.pads[1:]
-    if len(pads) > 1 and length < 2 * max(pad.radius for pad in pads):
-        names = " and ".join(f"'{pad.name}'" for pad in pads)
-        return f"it is too small: {1e3 * length:.0f} mm, for pads {names} side by side"
-    return "it may be too wide, or out of reach"
-
-
-def _places(names: Sequence[str], at: Array, low: Array, high: Array, chosen: NDArray[np.bool_]) -> str:
-    """``'left' (0 to 90 deg) at 97 deg and ...`` of those chosen; all angles [rad]."""
-    at, low, high = np.degrees([at, low, high])
-    return " and ".join(
-        f"'{names[k]}' ({low[k]:.0f} to {high[k]:.0f} deg) at {round(at[k])} deg"
-        for k in np.flatnonzero(chosen).tolist()
-    )
+def _blame(problem: PinchProblem, request: PinchRequest) -> str:
+    """Whether geometry or torque is to blame, with figures."""
+    reach = solve(BorneProblem(problem), request)
+    if not reach.holds:
+        return blame_geometry(problem, problem.geometry(reach.x[None]))
+    balanced = descend(problem, request, reach.x, ranges=False)
+    if balanced.violation > 1:
+        balanced = descend(BorneProblem(problem, _LITTLE), request, reach.x, ranges=False)
+    return blame_torque(problem, problem.geometry(balanced.x[None]))
 
 
 def _guesses(problem: PinchProblem, request: PinchRequest) -> Iterator[Array]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,6 +124,8 @@ class PinchProblem:
         self._palmar = np.array([pad.direction for pad in self.pads])
         self._radius = np.array([pad.radius for pad in self.pads])
         links, self._ball, self._ball_radius = obstacles(hand, self.pads)
+        self.obstacle_links = links
+        """Link of each part whose clearance counts."""
         self._ball_link = np.array([self.kinematics.link_index(name) for name in links], dtype=np.int64)
         self._prepare_mechanism()
         self.axes = object_axes(obj)
@@ -148,9 +151,20 @@ class PinchProblem:
         self._constant = hand.lengths.constant and hand.loops is None
         self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
-        self.in_use = (J_a @ self.follow).any(axis=1)
+        self.in_use: NDArray[np.bool_] = np.asarray((J_a @ self.follow).any(axis=1), dtype=bool)
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)
         self._rest()
+
+    def changed(
+        self, hand: HandDescription, obj: ObjectDescription, transmission: Transmission
+    ) -> PinchProblem:
+        """The same pinch with other figures: links, pads and what moves are the same."""
+        new = copy.copy(self)
+        new.hand, new.obj, new.transmission = hand, obj, transmission
+        new.joint_range = (hand.joint_lower[self.moving], hand.joint_upper[self.moving])
+        new._prepare_mechanism()
+        new.preferred = new._half_bent()
+        return new
 
     def _with_loops(self, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """These joints, and those that move with them through loops."""
@@ -348,6 +362,17 @@ class PinchProblem:
             return load  # the passive motions are at right angles to all that is borne
         found, rows = self._reactions(g, load)
         return (load @ self._free - (found[:, None] @ rows)[:, 0]) @ self._free.T
+
+    def off_balance(self, g: PinchGeometry) -> Array:
+        """Torques that neither actuators nor loops nor couplings bear ``(batch, n_q)`` [N m]."""
+        off = np.zeros_like(g.torque)
+        off[:, self.moving] = self._unheld(g)[:, self.moving] @ self._passive @ self._passive.T
+        return off
+
+    def slack(self, g: PinchGeometry) -> list[str]:
+        """Tendons that would have to push, by name."""
+        pushed = self._pulling & (self.tension(g)[0] < 0)
+        return [name for name, chosen in zip(self.hand.actuator_names, pushed, strict=True) if chosen]
 
     def _reactions(self, g: PinchGeometry, load: Array) -> tuple[Array, Array]:
         """Forces of actuators and loops ``(batch, n)`` and their rows ``(batch, n, n_free)``."""

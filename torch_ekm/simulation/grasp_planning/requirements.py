@@ -16,7 +16,6 @@ from .pinch_problem import PinchProblem
 
 _FACING = 0.3  # least cosine between a pad's direction and where it is to press; the planner wishes the same
 _SAMPLES = 2048
-_WIDEST = np.pi  # [rad]; the planner starts from parts of each range, as if it ran from open to closed
 _WIDER = np.pi / 2  # [rad] by which limits are moved to see which one is in the way
 
 
@@ -27,8 +26,6 @@ class Unmet(NamedTuple):
     """Pad or joint, by name."""
     problem: str
     remedy: str
-    certain: bool = True
-    """False: a pinch may be found all the same."""
 
     def __str__(self) -> str:
         return f"{self.part}: {self.problem}; {self.remedy}"
@@ -97,7 +94,7 @@ def unmet(problem: PinchProblem) -> list[Unmet]:
     found = [lack for pad in problem.pads if (lack := direction_unmet(problem.hand, pad)) is not None]
     low, high = problem.joint_range
     if found or _opposing(problem, low, high):
-        return [*found, *_too_wide(problem)]
+        return found
     names = " and ".join(f"'{pad.name}'" for pad in problem.pads)
     width = f"{1e3 * problem.obj.grasp_width:.0f} mm apart, the object's grasp_width"
     wider = [_opposing(problem, low - _WIDER * at, high + _WIDER * at) for at in np.eye(len(low))]
@@ -111,16 +108,6 @@ def unmet(problem: PinchProblem) -> list[Unmet]:
             f"no posture within the limits brings pads {names} face to face, {width}",
             f"its limits, {limits}, are the first to be looked at",
         )
-    ]
-
-
-def _too_wide(problem: PinchProblem) -> list[Unmet]:
-    low, high = np.degrees(problem.joint_range)
-    remedy = "let its limits run from open to closed: the planner starts within 13 to 65 % of them"
-    return [
-        Unmet(f"joint '{problem.hand.joint_names[joint]}'", f"its range is {b - a:.0f} deg", remedy, False)
-        for joint, a, b in zip(problem.moving, low, high, strict=True)
-        if b - a > np.degrees(_WIDEST)
     ]
 
 
