@@ -99,7 +99,7 @@ def test_an_encoder_that_is_wrong_in_one_look_moves_nothing_far_and_teaches_noth
             Reason.ACTUATOR_LIMITS,
         )
         assert done.reason in blameless
-    assert max(float(v.abs().max()) for v in plant.given) < 10 * DEG
+    assert max(float(v.abs().max()) for v in plant.given) < 16.5 * DEG  # of a step; the encoder says 109 deg
     assert float(knowledge.servo.bias.abs().max()) < 0.05 * DEG
 
 

@@ -377,13 +377,13 @@ def test_guards_have_limits_of_their_own() -> None:
 
 
 def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> None:
-    """100 observations; 100,000 by ``benchmarks/gate.py``."""
+    """100 observations each, median of five seeds; 100,000 by ``benchmarks/gate.py``."""
     seen, axis, model = held
 
-    def session(chance: float, observations: int) -> tuple[Obedient, ClosedLoop]:
+    def session(chance: float, observations: int, seed: int) -> tuple[Obedient, ClosedLoop]:
         plant, ekm, done = Obedient(model, seen, noise=3e-3), EnhancedModel.for_grasp(model, seen.state), 0
         controller = LookAndMoveController(ekm, axis)
-        loop = ClosedLoop(FuzzedPlant(plant, chance, seed=6), controller, safety=SAFETY)
+        loop = ClosedLoop(FuzzedPlant(plant, chance, seed=seed), controller, safety=SAFETY)
         sight = loop.plant
         while sight.observations < observations:
             start = plant.reset(done)
@@ -407,7 +407,10 @@ def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> N
             way.append(step.increment[-3:])
         return float(torch.stack(off).norm() / torch.stack(way).norm())
 
-    plant, fuzzed = session(0.15, observations=100)
-    assert float(torch.stack(plant.given).abs().max()) <= Guards().increment + 1e-9
+    errors = []
+    for seed in range(4, 9):
+        plant, fuzzed = session(0.15, observations=100, seed=seed)
+        assert float(torch.stack(plant.given).abs().max()) <= Guards().increment + 1e-9
+        errors.append(error(fuzzed.controller.enhanced, fuzzed.knowledge))
     nothing = EnhancedModel.for_grasp(model, seen.state), HandKnowledge.of(model.hand)
-    assert error(fuzzed.controller.enhanced, fuzzed.knowledge) < 0.6 * error(*nothing)
+    assert sorted(errors)[2] < 0.6 * error(*nothing)

@@ -29,7 +29,7 @@ ixy="0" ixz="0" iyy="1e-5" iyz="0" izz="1e-5"/></inertial>
 WRONG = """
 nonsense | No such command
 --nonsense | No such option
-hands --new file.txt | a path to a .urdf or .xml file
+hands --new file.txt | a path to a .urdf, .xml or .mjcf file
 hands --new none.urdf | no such URDF file
 hands --new broken.urdf | not well-formed XML
 hands --new finger.urdf | not overwritten

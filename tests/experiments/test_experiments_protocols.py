@@ -193,13 +193,12 @@ def test_same_seed_same_session() -> None:
     assert warm_up.poses == ()  # for pictures of turns only
 
 
-def test_an_object_that_is_larger_than_described_is_held_and_not_modelled() -> None:
-    """The model sees a gap where the pads press: the object is not lost, its description is wrong."""
+def test_an_object_that_is_larger_than_described_is_turned() -> None:
+    """The model sees a gap where the pads press: these are contacts, the description is wrong."""
     setting = Setting(engine="mujoco", plant=preset("nominal").replace(object_scale=1.15))
     turned = Bench(setting, "can", "E-KM").trial(0, 0, 9.0)
     assert isinstance(turned, TrialRecord)
-    assert (turned.reason, turned.steps) == ("unstable grasp", 0)
-    assert "check the object's size" in turned.message
+    assert turned.reason == "reached"
 
 
 def test_what_cannot_be_grasped_is_recorded_not_raised(monkeypatch: pytest.MonkeyPatch) -> None:
