@@ -133,12 +133,7 @@ class LookAndMoveController:
                 g, variance = self.enhanced.correction(one.state, w, len(nominal))
                 deviation = deviation + variance.sqrt()  # g errs alike along a path
             f, both = f.plus(nominal), both.plus(nominal + g)
-            said = one.said
-            if said is not None:
-                rows, pads = self.kinematic.hand.pad_rows(one.linearization.contacts.finger)
-                said = said.index_add(
-                    0, torch.tensor(pads), (one.linearization.described_normal_sensitivity @ part)[rows]
-                )
+            said = None if one.said is None else one.said + self._said(one.linearization, part)
             made.append(Piece(one.linearization, w, nominal, nominal + g, one.force, said))
         nominal, increment = made[0].nominal, made[0].increment
         if len(made) > 1:
@@ -306,14 +301,19 @@ class LookAndMoveController:
         slack = float(np.abs(solution.slack).max(initial=0.0))
         asked = float((self.focus.tolerance_scale * seen.desired).abs().max())
         limited = slack > 0.05 * asked and self._at_limit(seen.a, da, problem)
-        said = da.new_zeros(len(seen.hand.pads))
-        rows, pads = seen.hand.pad_rows(lin.contacts.finger)
-        said[pads] = (lin.described_normal_sensitivity @ da)[rows]
-        piece = Piece(lin, da, lin.step(da), predicted, self._force_after(lin, seen, da), said)
+        force = self._force_after(lin, seen, da)
+        piece = Piece(lin, da, lin.step(da), predicted, force, self._said(lin, da))
         return Decision(
             da, StopReason.RUNNING, seen.desired, predicted, lin.described_jacobian @ da, (piece,), limited,
             slack, grip=self.grip(lin, seen),
         )  # fmt: skip
+
+    def _said(self, lin: Linearization, w: Tensor) -> Tensor:
+        """Change of each pad's force by the model alone, to first order; 0 where none touches [N]."""
+        said = w.new_zeros(len(self.kinematic.hand.pads))
+        rows, pads = self.kinematic.hand.pad_rows(lin.contacts.finger)
+        said[pads] = (lin.described_normal_sensitivity @ w)[rows]
+        return said
 
     def _force_after(self, lin: Linearization, seen: Situation, da: Tensor) -> Tensor | None:
         """Normal force of each pad after an increment [N], NaN of one that does not touch; None: unknown."""
@@ -322,9 +322,8 @@ class LookAndMoveController:
             return None
         rows, pads = seen.hand.pad_rows(lin.contacts.finger)
         force = da.new_full((len(seen.hand.pads),), torch.nan)
-        force[pads] = (
-            torch.from_numpy(f_n + seen.drift_of(list(range(len(f_n))))) + lin.normal_force_sensitivity @ da
-        )[rows]
+        drift = 0.0 if seen.drift is None else seen.drift
+        force[pads] = (torch.from_numpy(f_n + drift) + lin.normal_force_sensitivity @ da)[rows]
         return force
 
     def grip(self, lin: Linearization, seen: Situation) -> Grip | None:

@@ -37,6 +37,9 @@ class OnTheWay:
     def __init__(self, guards: Guards, seen: Observation, decision: Decision) -> None:
         self._guards, self._seen, self._band = guards, seen, decision.band
         self._ends = torch.stack([one.action for one in decision.pieces]).cumsum(0)
+        end = self._ends[-1]
+        self._whole = end / (end @ end).clamp(min=1e-12)
+        self._way = self._ends @ self._whole  # of each waypoint along the whole
         self._twists = torch.stack([one.increment[-6:] for one in decision.pieces]).cumsum(0)
         self._forces = [one.force for one in decision.pieces]
         self._frames = [(seen.taken.encoders, seen.a)]
@@ -79,9 +82,7 @@ class OnTheWay:
 
     def _place(self, a: Tensor) -> tuple[int, float]:
         """The piece in which the encoders are, and how much of it is done."""
-        end = self._ends[-1]
-        done = min(max(float((a - self._seen.a) @ end) / max(float(end @ end), 1e-12), 0.0), 1.0)
-        way = self._ends @ end / (end @ end).clamp(min=1e-12)  # of each waypoint along the whole
+        way, done = self._way, min(max(float((a - self._seen.a) @ self._whole), 0.0), 1.0)
         k = min(int((way < done).sum()), len(way) - 1)
         start = float(way[k - 1]) if k else 0.0
         return k, min(max((done - start) / max(float(way[k]) - start, 1e-9), 0.0), 1.0)
