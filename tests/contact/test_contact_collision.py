@@ -278,6 +278,7 @@ def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> 
 @settings(max_examples=100)
 @given(pose=poses, along=st.tuples(*[st.floats(-1, 1)] * 6))
 @example(pose=(0.047, 0.031, 0.0, 0.0, 0.0, 0.0), along=(0.0, 0.0, 0.0, 0.0, 0.0, 1.0))  # over an edge
+@example(pose=(0.045, 0.0, 0.03125, 0.0, 0.0, 0.0), along=(1.0, 0.0, 0.0, 0.0, 0.0, 0.0))  # on it
 def test_no_jumps_anywhere_outside(kind: str, pose: tuple[float, ...], along: tuple[float, ...]) -> None:
     """A change of the pose by 1e-7 (m, rad) moves the contact point by at most R/(0.2 rho) that."""
     position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])

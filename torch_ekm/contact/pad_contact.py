@@ -8,7 +8,7 @@ import numpy as np
 
 from ..description import ContactPad, Shape
 from ..typing import Array
-from .signed_distance import point_distance, surface_curvature, tangents
+from .signed_distance import Vec, point_distance, surface_curvature, tangents
 
 _EYE = np.eye(3)
 
@@ -139,13 +139,17 @@ def _along(solid: Solid, m: tuple, t: tuple, half: float, most: float) -> tuple[
     s = _closest(solid, m, t, half, most)
     if abs(s) >= half:  # at a round end, crown or not
         return s, most
-    c = (m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])
-    if surface_curvature(solid.shape, c, solid.distance(*c)[1])[1]:
-        return s, most  # without crown a pad along the face beyond the edge would jump to its end
+
+    def slope(x: float) -> tuple[Vec, Vec, float]:
+        c = (m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2])
+        n = solid.distance(*c)[1]
+        return c, n, n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
+
     step = 1e-6
-    points = ((m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2]) for x in (s + step, s - step))
-    ahead, behind = (solid.distance(*point)[1] for point in points)
-    curved = sum((a - b) * axis for a, b, axis in zip(ahead, behind, t, strict=True)) / (2 * step)
+    (_, _, behind), (c, n, here), (_, _, ahead) = (slope(x) for x in (s - step, s, s + step))
+    if surface_curvature(solid.shape, c, n)[1]:
+        return s, most  # without crown a pad along the face beyond the edge would jump to its end
+    curved = min(here - behind, ahead - here) / step  # the face's, where s is within a step of its edge
     crown = min(most, max(0.0, most - curved))
     return (_closest(solid, m, t, half, crown) if crown < most else s), crown
 

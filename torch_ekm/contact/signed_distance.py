@@ -21,6 +21,9 @@ from ..typing import Array
 Vec = tuple[float, float, float]
 Distance = Callable[[float, float, float], tuple[float, Vec]]
 """Point [m] -> signed distance [m] and its gradient, the outward normal."""
+_NO_DIRECTION = (
+    1e-150  # [m]: squares of less leave the range of a float, and a unit vector by them its length
+)
 
 
 def point_distance(shape: Shape) -> Distance:
@@ -118,7 +121,7 @@ def _box(hx: float, hy: float, hz: float, radius: float) -> Distance:
         ex, ey, ez = abs(x) - hx, abs(y) - hy, abs(z) - hz
         ox, oy, oz = max(ex, 0.0), max(ey, 0.0), max(ez, 0.0)
         d = sqrt(ox * ox + oy * oy + oz * oz)
-        if d > 0:
+        if d > _NO_DIRECTION:
             return d - radius, (copysign(ox, x) / d, copysign(oy, y) / d, copysign(oz, z) / d)
         if ex >= ey and ex >= ez:
             return ex - radius, (copysign(1.0, x), 0.0, 0.0)
@@ -136,7 +139,7 @@ def _cylinder(radius: float, length: float) -> Distance:
         rho = hypot(x, y)
         er, ez = rho - radius, abs(z) - half
         # on the axis the radial direction is undefined: any will do
-        ux, uy = (x / rho, y / rho) if rho > 0 else (1.0, 0.0)
+        ux, uy = (x / rho, y / rho) if rho > _NO_DIRECTION else (1.0, 0.0)
         if er <= 0 and ez <= 0:
             return (er, (ux, uy, 0.0)) if er >= ez else (ez, (0.0, 0.0, copysign(1.0, z)))
         orad, oz = max(er, 0.0), max(ez, 0.0)
