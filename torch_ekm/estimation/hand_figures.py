@@ -72,7 +72,7 @@ class DescribedFigures(Recorded, nn.Module):
     def solve(self, equations: MotionEquations) -> None:
         """J_m is the description's."""
 
-    def present(self, described: Drives, *, scaled: bool = False) -> tuple[Float[Tensor, " n_q"], Drives]:
+    def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
         """The description's."""
         return described.actuation.new_zeros(described.actuation.shape[-1]), described
 
@@ -243,18 +243,10 @@ class HandFigures(ParameterFilter):
             self._solved = equations, self.mean.numpy().copy(), motion
         return motion
 
-    def present(self, described: Drives, *, scaled: bool = False) -> tuple[Float[Tensor, " n_q"], Drives]:
-        """Change of the springs against the description [N m/rad] and the drives, both as known now.
-
-        Args:
-            scaled: springs and stiffnesses are divided by the mean factor of the stiffnesses. Motions do not
-                determine a factor that they have in common; forces are then on the description's scale.
-        """
+    def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:
+        """Change of the springs against the description [N m/rad] and the drives, both as known now."""
         J_a, K_a = described
-        now, stiff = self._described * self._factors, self._kind == KINDS.index("stiffness")
-        if scaled and stiff.any():
-            unit = np.exp(np.log(self._factors[stiff]).mean())
-            now = np.where(stiff | (self._kind == KINDS.index("springs")), now / unit, now)
+        now = self._described * self._factors
         change, arms, stiffness = (
             torch.from_numpy(values[self._kind == k]).to(J_a)
             for k, values in enumerate((now - self._described, now, now))

@@ -219,7 +219,7 @@ class FollowedFigures(Protocol):
     def solve(self, equations: MotionEquations) -> Motion | None:
         """J_m with the present figures; None: that of the description holds."""
 
-    def present(self, described: Drives, *, scaled: bool = False) -> tuple[Tensor, Drives]:
+    def present(self, described: Drives) -> tuple[Tensor, Drives]:
         """Change of the springs against the description [N m/rad], and the drives."""
         ...
 

@@ -122,8 +122,7 @@ class ContactMotion:
     ``a`` nothing is remembered: encoders and joints give the forces of compliant actuators, gaps are those of
     the detector. The first is for a hand that is not quite as described, the second for one that is.
 
-    A model that follows figures of the hand moves with those that are known when the motion begins, their
-    stiffnesses and springs divided by the mean factor of the stiffnesses: forces change as much as described.
+    A model that follows figures of the hand moves with those that are known when the motion begins.
 
     With a detector of one's own only what it reports can touch.
 
@@ -147,7 +146,7 @@ class ContactMotion:
         self._springs = np.zeros(model.hand.n_q)
         figures, equations = model.figures, start.equations
         if figures is not None and equations is not None and figures.solve(equations) is not None:
-            springs, drives = figures.present(drives, scaled=True)
+            springs, drives = figures.present(drives)
             self._springs = springs.detach().double().numpy()
         self._laws = laws = HandLaws(model, drives)
         self._placed: PlacedGrasp | None = None
