@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import model_toys
 import pytest
@@ -218,20 +217,6 @@ def test_a_motion_that_lets_go_is_followed_and_does_not_leap(held) -> None:
     for _ in range(16):
         parts.move(w / 16)
     assert whole.state.minus(parts.state).norm() < 0.02 * whole.state.minus(start.state).norm()
-
-
-def test_forces_keep_the_scale_of_the_description(held) -> None:
-    """Figures four times as stiff move the object alike."""
-    model, start, a, _ = held
-    figures = HandFigures.of(model.hand)
-    stiff = [name.startswith(("spring", "stiffness")) for name in figures.names]
-    figures.mean[stiff] = math.log(4) / torch.from_numpy(figures._prior_std)[stiff]
-    push = torch.zeros(len(a), dtype=F64)
-    push[model.hand.actuator_names.index("thumb_distal")] = 0.05
-    described = ContactMotion(model, start).move(push)
-    found = ContactMotion(model.with_figures(figures), start).move(push)
-    assert described.normal["thumb"] > float(start.forces.normal[0]) + 0.1
-    assert found.normal == pytest.approx(described.normal, rel=1e-6)
 
 
 def test_forces_answer_by_the_figures_that_are_known(held, exact) -> None:
