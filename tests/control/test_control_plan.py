@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from itertools import pairwise
 
@@ -23,7 +24,9 @@ from torch_ekm.control import (
     StopReason,
     WholeTurn,
 )
+from torch_ekm.control.rehearsal import Rehearsal
 from torch_ekm.control.situation import LinearizedModel
+from torch_ekm.description import load_object
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import StateError
 from torch_ekm.model import KinematicModel
@@ -64,6 +67,45 @@ def test_a_path_is_that_of_the_model_hand(held, loop, target) -> None:
     assert f"{plan.safe} of {len(plan.waypoints)} waypoints are safe" in lines[0]
     assert "deg to go" in lines[-1]
     assert "off the axis" in lines[-1]
+
+
+@pytest.fixture(scope="module")
+def slippery(held) -> KinematicModel:
+    """The same grasp of a box with a third of its friction."""
+    return KinematicModel(held[2].hand, dataclasses.replace(load_object("box"), friction=0.3))
+
+
+def test_the_tangent_is_that_of_the_motion_in_which_a_pad_slides(held, slippery) -> None:
+    """Against differences of motions; the linearization where it begins is off by more than a degree."""
+    seen, hand = held[0], ModelHand(slippery, held[0].state, held[0].a, held[0].fingertip_force)
+    w = torch.zeros_like(seen.a)
+    w[hand.hand.actuator_names.index("middle_distal")] = 0.08
+    first = hand.linearization
+    J, rest = hand.tangent(w)
+    assert torch.equal(hand.a, seen.a)  # nothing moves
+
+    def moved(way: torch.Tensor) -> torch.Tensor:
+        there = copy.copy(hand)
+        there.command(way)
+        return there.increment
+
+    torch.testing.assert_close(J @ w + rest, moved(w), rtol=0, atol=1e-9)
+    assert float((first.step(w) - moved(w))[-3:].norm()) > 1 * DEG
+    for i in range(len(w) - 1):  # the last one stands at the end of its range
+        h = torch.zeros_like(w)
+        h[i] = 1e-4
+        found = (moved(w + h) - moved(w - h)) / 2
+        assert float((J @ h - found).norm()) < 0.05 * float(found.norm())
+
+
+def test_a_piece_in_which_a_pad_slides_is_chosen_about_where_it_leads(held, slippery) -> None:
+    seen, axis, _ = held
+    controller = LookAndMoveController(slippery, axis)
+    target = PoseTarget.turned(seen.state, axis, degrees=-15)
+    path = [state for _, state in Rehearsal(controller, seen, target, 2.5 * DEG).pieces()]
+    assert len(path) <= 8
+    assert controller.focus.error(target, path[-1]) < 0.1 * DEG
+    assert controller.focus.off_rotation(path[-1].minus(seen.state)) < 0.2 * DEG
 
 
 def test_a_plan_changes_nothing(loop, target) -> None:
@@ -151,7 +193,8 @@ def test_contacts_of_links_are_no_pads() -> None:
     controller = LookAndMoveController(model, plant.rotation_axis)
     far = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=60)
     plan = WholeTurn().plan(controller, seen, far, HandKnowledge.of(plant.hand), 0.0, whole=True)
-    lin = plan.waypoints[-1].piece.linearization
+    lins = [one.piece.linearization for one in plan.waypoints]
+    lin = next(one for one in lins if set(one.contacts.finger) - {pad.name for pad in plant.hand.pads})
     fingers = lin.contacts.finger
     pads = [i for i, name in enumerate(fingers) if name in {pad.name for pad in plant.hand.pads}]
     (link,) = set(range(len(fingers))) - set(pads)

@@ -78,8 +78,8 @@ def test_a_turn_ends_where_the_model_said(grasp) -> None:
     seen = plant.reset(0)
     reach = ClosedLoop(plant, controller).reach()
     assert reach.end.kind is PathEnd.FRICTION
-    assert reach.end.what == ("thumb",)
-    assert str(reach) == f"{reach.angle / DEG:.1f} deg (friction: thumb)"
+    assert reach.end.what == ("index", "middle")
+    assert str(reach) == f"{reach.angle / DEG:.1f} deg (friction: index, middle)"
     assert "no equilibrium is near" in reach.end.message
     along = [turned(plant.rotation_axis, seen.state, state) for state in reach.plan.states]
     assert along[-1] == max(along)
@@ -93,7 +93,7 @@ def test_a_turn_ends_where_the_model_said(grasp) -> None:
     plant.reset(0)
     other = ClosedLoop(plant, controller).reach(sign=-1)
     assert other.angle < other.safe < 0
-    assert "middle_2" in str(other)
+    assert other.end.kind is PathEnd.LINK
 
 
 def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:

@@ -132,4 +132,4 @@ def test_what_is_lost_as_the_object_turns_either_way_is_no_answer_to_the_actuato
     torch.testing.assert_close(learner.correction, true, atol=0.5, rtol=0)
     still, w = torch.zeros(1, dtype=F64), torch.zeros(3, dtype=F64)
     assert float(learner.spread(w, still, 0.0)) == pytest.approx(float(learner.variance.sqrt()))
-    assert float(ForceSensitivity(1, 3).spread(w, still, 0.5)) == pytest.approx(math.hypot(0.3, 0.45 * 5.0))
+    assert float(ForceSensitivity(1, 3).spread(w, still, 0.5)) == pytest.approx(math.hypot(0.3, 0.3 * 5.0))

@@ -348,7 +348,7 @@ class LookAndMoveController:
         enhanced, da = self.enhanced, seen.a.new_zeros(len(seen.a))
         linear = enhanced is None or enhanced.affine
         for _ in range(1 if linear else _ITERATIONS):
-            model = LinearizedModel.about(da, lin, enhanced)
+            model = LinearizedModel.about(da, lin, enhanced, seen.bend)
             problem = build_qp(len(da), [part.rows(model, seen) for part in (*self.tasks, *self.limits)])
             solution = problem.solve()
             best = torch.as_tensor(solution.u, dtype=da.dtype)
@@ -360,6 +360,7 @@ class LookAndMoveController:
         predicted = model.offset + model.jacobian @ da
         if enhanced is not None and not linear:
             predicted = enhanced.linearize(seen.state, da, lin.manipulation_jacobian)[0]
+            predicted = predicted if seen.bend is None else predicted + seen.bend
         return da, predicted, problem, solution
 
     def _at_limit(self, a: Tensor, da: Tensor, problem: ControlProblem) -> bool:

@@ -12,7 +12,7 @@ from torch import nn
 from .._recorded import Recorded, bound_problems
 from ..typing import Float, Tensor
 
-_START = 0.1, 0.2  # along and across, of a hand of which nothing is known
+_START = 0.07, 0.2  # along and across, of a hand of which nothing is known
 _RECENT = 0.25  # weight of the last motion,
 _WHOLE = math.radians(2.5)  # if it is as long as this [rad]
 _SLIP, _LOSS, _MOST = 0.5, 1.5, 3.0  # [N] by which is gripped tighter, and at most

@@ -14,7 +14,7 @@ from ..enhanced.enhanced_model import kinematic_and_enhanced
 from ..estimation.force_sensitivity import ForceSensitivity
 from ..exceptions import GraspEndsError, GraspError
 from ..kinematics import GraspState
-from ..model import ContactMotion, KinematicModel, Linearization
+from ..model import ContactMotion, ContactStep, KinematicModel, Linearization
 from ..plant import Observation, PlantStatus
 from ..typing import Float, Tensor
 
@@ -60,6 +60,7 @@ class ModelHand:
         self.time, self.failure = 0.0, None
         self._motion: ContactMotion | None = None
         self._linearization: Linearization | None = None
+        self._tried: tuple[ContactMotion, Tensor, ContactMotion, ContactStep] | None = None
         self._way = self.a.new_zeros(self.hand.n_a)
         self.increment = self.correction = self.a.new_zeros(self.state.n_s)
         """Of the last motion, and g's part of it [rad, m, rad]."""
@@ -79,10 +80,9 @@ class ModelHand:
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the encoders by ``delta_a`` [rad], as far as their ranges allow."""
-        way = (self.a + delta_a).clamp(self._a_min, self._a_max) - self.a
         self._stand()
         if self._motion is not None and not self.failure:
-            self._move(way, self._motion)
+            self._move(self._within(delta_a), self._motion)
         self.time += 1.0
         return self.observe()
 
@@ -95,6 +95,19 @@ class ModelHand:
             with contextlib.suppress(GraspError):
                 self._linearization = self._motion.linearize(self._way)
         return self._linearization
+
+    def tangent(self, w: Float[Tensor, " n_a"]) -> tuple[Tensor, Tensor] | None:
+        """``f(s, u) ~ J u + c`` about u = w: J with contacts that do what they do at the end of it. Nothing
+        moves. None: the model has no such motion."""
+        self._stand()
+        if self._motion is None or self.failure:
+            return None
+        way = self._within(w)
+        try:
+            _, step = self._moved(way, self._motion)
+        except GraspError:
+            return None
+        return step.jacobian, step.increment - step.jacobian @ way
 
     def close(self) -> None:
         """Does nothing: the model holds no device."""
@@ -136,9 +149,8 @@ class ModelHand:
         correction = None
         if self._enhanced is not None:
             correction, _ = self._enhanced.correction(self.state, w, self.state.n_s)
-        motion = copy.copy(motion)  # a copy of this hand stays where it is
         try:
-            step = motion.move(w)
+            motion, step = self._moved(w, motion)
             if correction is not None:
                 motion.shift(correction)
         except GraspError as error:
@@ -162,6 +174,18 @@ class ModelHand:
                 self._stands = False
             bear = (before > least) & (bears > least)
             self.force = bears.where(~bear, (before + change).clamp(min=least))
+
+    def _within(self, w: Tensor) -> Tensor:
+        """As far as the ranges of the actuators allow."""
+        return (self.a + w).clamp(self._a_min, self._a_max) - self.a
+
+    def _moved(self, w: Tensor, motion: ContactMotion) -> tuple[ContactMotion, ContactStep]:
+        """A copy of the motion after w, for a copy of this hand stays where it is, and what it did."""
+        if self._tried is None or self._tried[0] is not motion or not torch.equal(self._tried[1], w):
+            after = copy.copy(motion)
+            self._tried = motion, w, after, after.move(w)
+        _, _, after, step = self._tried
+        return copy.copy(after), step
 
     def _of_pads(self, normal: Mapping[str, float]) -> Tensor:
         """Of each pad of the hand, 0 of one that does not touch [N]."""

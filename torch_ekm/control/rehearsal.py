@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from enum import Enum
@@ -28,6 +29,7 @@ _THERE = 0.1 * _DEG  # [rad] of the error, as a turn: the path ends
 _MOST = 60  # pieces
 LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is planned when it is there
 _HALVES, _CUT = 3, 0.99  # times that a piece is tried, and share of an actuator's step that cuts it short
+_BENDS = 0.25 * _DEG  # of a piece beyond its linearization: it is chosen once more, about where it leads
 _GRIPPED = 0.95  # of the wanted grip
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
 _SLIDES = 0.05  # of its friction, that a pad at its limit has to spare
@@ -129,11 +131,20 @@ class Rehearsal:
         desired = self._limiting(focus.step_scale * (focus.matrix @ error)) / focus.step_scale
         most = min((x.step for x in controller.limits if isinstance(x, ActuatorLimit)), default=math.inf)
         for _ in range(_HALVES):
-            decision = controller.choose(lin, controller.situation(lin, here.a, force, error, desired))
+            seen = controller.situation(lin, here.a, force, error, desired)
+            decision = controller.choose(lin, seen)
             if float(decision.delta_a.abs().max()) < _CUT * most:
                 break
             desired = desired / 2  # else the focused pose is served at the expense of grip
-        return decision
+        found = self.hand.tangent(decision.delta_a) if decision.status is StopReason.RUNNING else None
+        if found is None:
+            return decision
+        J, rest = found
+        bends = (J - lin.manipulation_jacobian) @ decision.delta_a + rest
+        if float(bends[-3:].norm()) < _BENDS:
+            return decision
+        again = dataclasses.replace(lin, manipulation_jacobian=J)
+        return controller.choose(again, dataclasses.replace(seen, bend=rest))
 
     def _there(self, state: GraspState) -> bool:
         return self._target is not None and self._controller.focus.error(self._target, state) <= _THERE

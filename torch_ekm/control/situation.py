@@ -42,6 +42,8 @@ class Situation:
     drift: Array | None = None
     """By which the normal forces change as the object turns by :attr:`desired`, whatever the motors do [N];
     None: 0."""
+    bend: Float[Tensor, " n_s"] | None = None
+    """c of ``f(s, u) ~ J u + c`` about a motion that is not small, J that of the linearization; None: 0."""
     grip: float | None = None
     """Wanted of the finger that opposes the others, see :class:`GripForceTask` [N]; None: nothing."""
 
@@ -91,11 +93,16 @@ class LinearizedModel:
 
     @classmethod
     def about(
-        cls, action: Float[Tensor, " n_a"], kinematic: Linearization, enhanced: EnhancedModel | None = None
+        cls,
+        action: Float[Tensor, " n_a"],
+        kinematic: Linearization,
+        enhanced: EnhancedModel | None = None,
+        bend: Float[Tensor, " n_s"] | None = None,
     ) -> LinearizedModel:
         """``(f + g)(a + d) ~ value + J d = (value - J a) + J (a + d)`` about one action a."""
         J = kinematic.manipulation_jacobian
-        if enhanced is None:
-            return cls(kinematic, J.new_zeros(len(J)), J)
-        value, J = enhanced.linearize(kinematic.state, action, J)
-        return cls(kinematic, value - J @ action, J)
+        offset = J.new_zeros(len(J)) if bend is None else bend
+        if enhanced is not None:
+            value, J = enhanced.linearize(kinematic.state, action, J)
+            offset = offset + value - J @ action
+        return cls(kinematic, offset, J)

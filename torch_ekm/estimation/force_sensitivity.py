@@ -18,8 +18,9 @@ from .update import update
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _WAY_STD = 10.0  # [N/rad] of an entry of l
 _LARGEST_STD = 20.0  # [N] of a change of force that c and B do not explain
+_LEAST_STD = 0.5 * NOISE.force  # [N] of a pad that does as c and B say
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
-_USUAL = 1 / 0.45**2 - 1  # information on theta that hands have in common, on top of the prior's
+_USUAL = 1 / 0.3**2 - 1  # information on theta that hands have in common, on top of the prior's
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 
@@ -31,7 +32,7 @@ class ForceSensitivity(Recorded, nn.Module):
         r = (f_n+ - f_n) - S w - theta u                 of each pad that measures
         D <- D - (1 - .97) D u u' D / (u' D u)           motions, forgotten in the direction of a new one
         theta <- update(theta, (D / s^2 + I)^-1, r, u', s^2),  D <- D + u u'
-        s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .3^2)       what is left: a pad that rubs teaches less
+        s^2 <- .9 s^2 + .1 max(r^2 - u' P u, .15^2)      what is left: a pad that rubs teaches less
 
     c of each pad scales what the model says: a hand that gives more than it is described to presses less. l
     is what a finger gains or loses as the object turns by phi either way, by friction and creep of cables and
@@ -87,7 +88,7 @@ class ForceSensitivity(Recorded, nn.Module):
     ) -> Float[Tensor, " n_pads"]:
         """``sqrt(u' P u + s^2)``: standard deviation of what is predicted for the change of each force [N].
 
-        P with theta ~ N(0, 0.45^2) before the first motion, as hands were found to be: the wider prior of the
+        P with theta ~ N(0, 0.3^2) before the first motion, as hands were found to be: the wider prior of the
         estimate lets it follow a hand that is none of these.
 
         Args:
@@ -151,7 +152,7 @@ class ForceSensitivity(Recorded, nn.Module):
         after, _ = update(theta, _covariance(D, variance), *one, bounds=(-NOISE.furthest, NOISE.furthest))
         theta[known] = after[known]
         D[known] += (u[:, :, None] * u[:, None, :])[known]
-        unexplained = np.clip(bounded**2 - doubt, NOISE.force**2, _LARGEST_STD**2)
+        unexplained = np.clip(bounded**2 - doubt, _LEAST_STD**2, _LARGEST_STD**2)
         variance[known] += _RECENT * (unexplained - variance)[known]
         return torch.from_numpy(r)
 
@@ -160,7 +161,7 @@ class ForceSensitivity(Recorded, nn.Module):
         wrong = bound_problems(
             state,
             theta=(-NOISE.furthest, NOISE.furthest),
-            variance=(0.5 * NOISE.force**2, _LARGEST_STD**2),  # files of a smaller noise hold
+            variance=(0.9 * _LEAST_STD**2, _LARGEST_STD**2),  # files of a smaller noise hold
             evidence=(-_MOST_EVIDENCE, _MOST_EVIDENCE),
         )
         if wrong:

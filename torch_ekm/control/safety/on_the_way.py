@@ -15,7 +15,7 @@ from .safety import Guards
 if TYPE_CHECKING:
     from ..decision import Decision
 
-_DEVIATIONS = 4.0
+_DEVIATIONS = 2.0  # as far as the plan calls safe
 _RUNNING = 2  # frames that leave the band: one may be a wrong picture
 _SWINGS = math.radians(1.0)  # [rad] by which a moving object lags behind its equilibrium
 _FADES = 0.5  # of the force that was planned, below which a finger is about to let go
@@ -25,7 +25,7 @@ class OnTheWay:
     """Whether a movement goes on: no finger presses too hard or fades, the object is held, and near its path.
 
     The object's rotation in a picture is held against that of the path where the encoders were when it was
-    taken, and against the band at the end of the movement; forces against those of the path, of which a
+    taken, and against the band there, which grows with the way; forces against those of the path, of which a
     finger keeps half and more.
 
     Args:
@@ -58,9 +58,12 @@ class OnTheWay:
         elif force is not None and (fades := self._fades(seen, force)):
             self.why = fades
         elif self._band is not None and seen.status is PlantStatus.HELD:
-            turn = self._off_path(seen)[-3:]
-            off = float(turn.norm())
-            most = _DEVIATIONS * max(self._band.off_std, float(self._band.twist_std[-3:].max())) + _SWINGS
+            done, twist = self._off_path(seen)
+            off, std = (
+                float(twist[-3:].norm()),
+                max(self._band.off_std, float(self._band.twist_std[-3:].max())),
+            )
+            most = _DEVIATIONS * done * std + _SWINGS
             self._off = self._off + 1 if off > most else 0
             if self._off >= _RUNNING:
                 self.why = f"the object is {math.degrees(off):.1f} deg off its path"
@@ -82,17 +85,23 @@ class OnTheWay:
 
     def _place(self, a: Tensor) -> tuple[int, float]:
         """The piece in which the encoders are, and how much of it is done."""
-        way, done = self._way, min(max(float((a - self._seen.a) @ self._whole), 0.0), 1.0)
+        way, done = self._way, self._done(a)
         k = min(int((way < done).sum()), len(way) - 1)
         start = float(way[k - 1]) if k else 0.0
         return k, min(max((done - start) / max(float(way[k]) - start, 1e-9), 0.0), 1.0)
 
-    def _off_path(self, seen: Observation) -> Tensor:
-        """Twist of the object that the path does not have where the picture was taken [m, rad]."""
-        k, share = self._place(self._encoders(seen.taken.pose))
+    def _done(self, a: Tensor) -> float:
+        """Share of the whole way, at encoders a [rad]."""
+        return min(max(float((a - self._seen.a) @ self._whole), 0.0), 1.0)
+
+    def _off_path(self, seen: Observation) -> tuple[float, Tensor]:
+        """Share of the way where the picture was taken, and the twist of the object there that the path does
+        not have [m, rad]."""
+        a = self._encoders(seen.taken.pose)
+        k, share = self._place(a)
         before = self._twists[k - 1] if k else torch.zeros_like(self._twists[0])
         planned = before + share * (self._twists[k] - before)
-        return seen.state.minus(self._seen.state)[-6:] - planned
+        return self._done(a), seen.state.minus(self._seen.state)[-6:] - planned
 
     def _encoders(self, time: float) -> Tensor:
         """Where they were, between two readings."""
