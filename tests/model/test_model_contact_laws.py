@@ -59,6 +59,14 @@ def test_a_block_that_is_pushed_beyond_its_cone_slides_until_its_spring_bears_th
     assert rate.z[0, 0] == pytest.approx(-np.sign(side) * MU / 2.0)
 
 
+def test_a_contact_that_slides_and_bears_nothing_answers_with_numbers() -> None:
+    """Where rounding puts a contact on the edge between sliding and open."""
+    found = answer(block(push=1.0, side=0.7))
+    edge = found._replace(lam=0 * found.lam, t=0 * found.t)
+    rate = edge.response(np.array([[0.0], [1.0]]), np.ones((1, 1)))
+    assert all(np.isfinite(part).all() for part in rate)
+
+
 def test_a_block_that_is_pulled_off_opens() -> None:
     found = answer(block(push=-1.0, side=0.3))
     np.testing.assert_allclose(found.z, [0.15, 0.5], atol=1e-12)

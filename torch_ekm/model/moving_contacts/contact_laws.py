@@ -102,7 +102,8 @@ class StepSolution(NamedTuple):
         rates = np.zeros((len(self.jacobian), k))
         rates[:n_z] = load
         rates[n_z : n_z + m] = np.where(self.active[:, None], _RHO_NEWTON * gap, 0.0)
-        for i in np.flatnonzero(self.slides):  # the disc of a contact that slides shrinks as its gap grows
+        # the disc of a contact that slides shrinks as its gap grows; one that bears nothing has none
+        for i in np.flatnonzero(self.slides & (self.lam[: len(self.slides)] > _TOLERANCE)):
             rows = slice(n_z + m + i * self.t.shape[1], n_z + m + (i + 1) * self.t.shape[1])
             rates[rows] = _RHO_NEWTON * np.outer(self.t[i] / self.lam[i], gap[i])
         try:
