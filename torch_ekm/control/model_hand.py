@@ -66,6 +66,7 @@ class ModelHand:
         """Of the last motion, and g's part of it [rad, m, rad]."""
         self.said = self.a.new_zeros(len(self.hand.pads))
         """Change of the normal forces in it, by the model alone [N]."""
+        self._spare = self.said
         self._bears = self.said  # what the model thinks that the pads bear: other than they measure
         self._measured, self._stands = force is not None, False
         self.force = self.a.new_zeros(len(self.hand.pads)) if force is None else force
@@ -95,6 +96,12 @@ class ModelHand:
             with contextlib.suppress(GraspError):
                 self._linearization = self._motion.linearize(self._way)
         return self._linearization
+
+    @property
+    def margin(self) -> Float[Tensor, " n_pads"]:
+        """``mu_s f_n - |f_t|`` of each pad here [N]."""
+        self._stand()
+        return self._spare
 
     def tangent(self, w: Float[Tensor, " n_a"]) -> tuple[Tensor, Tensor] | None:
         """``f(s, u) ~ J u + c`` about u = w: J with contacts that do what they do at the end of it. Nothing
@@ -139,9 +146,9 @@ class ModelHand:
                 self.failure = GraspEndsError(str(lin.doubts[0]))
             self._motion = ContactMotion(self.kinematic, lin)
             self._linearization = self._motion.answered(lin)
-            self._bears = self._of_pads(
-                dict(zip(lin.contacts.finger, lin.forces.normal.tolist(), strict=True))
-            )
+            names = lin.contacts.finger
+            self._bears = self._of_pads(dict(zip(names, lin.forces.normal.tolist(), strict=True)))
+            self._spare = self._of_pads(dict(zip(names, lin.forces.margin.tolist(), strict=True)))
         except GraspError as error:
             self.failure = error
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 
-from .._noise import NOISE
 from ..kinematics import GraspState
 from ..plant import Observation
+from ..typing import Tensor
 from .bands import Band, Bands
 from .decision import Decision, Piece, StopReason
 from .focus import FocusedPose, PoseTarget
@@ -26,10 +26,8 @@ if TYPE_CHECKING:
 
 _DEG = math.pi / 180
 _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
-_HOLDS = 0.05  # of its friction that each finger has to spare, for a step of which the model is not sure
 _BACK = 1.5  # times off_rotation from which an object that is farther off is not turned back: it slips out
 _GRIP = 3  # pieces of a movement that grips: pads that read wrong are seen after it
-_LOOSENS = 0.8  # of a finger's force that a grip leaves at least
 _CLOSE = 0.3 * _DEG  # [rad] from which one is enough
 
 
@@ -185,13 +183,13 @@ class WholeTurn:
         off = focus.off_rotation(target.error(seen.state))
         most = max(self.off_rotation, min(off, _BACK * self.off_rotation))
         rehearsal = Rehearsal(controller, seen, target, self.piece, longest)
-        bands = Bands(controller, knowledge, seen, target)
+        bands, spare = Bands(controller, knowledge, seen, target), rehearsal.hand.margin
         waypoints: list[Waypoint] = []
         asked = focus.error(target, seen.state)
         safe, against, nearest = 0, "", (asked, 0)
         for piece, state in rehearsal.pieces():
             waypoints.append(Waypoint(piece, state, bands.add(piece, state)))
-            against = against or self._against(waypoints[-1].band, most, first=len(waypoints) == 1)
+            against = against or self._against(waypoints, most, spare)
             safe += not against
             left = focus.error(target, state)
             nearest = min(nearest, (left, len(waypoints)))
@@ -205,17 +203,32 @@ class WholeTurn:
         safe = min(safe, len(waypoints))
         if safe:
             decision = _joined(controller, seen, waypoints[:safe], rehearsal)
+        elif waypoints:
+            wanted = focus.matrix @ target.error(seen.state)
+            decision = controller.none(StopReason.GIVEN_UP, against, wanted)
         else:
-            decision = self._one_step(controller, seen, target, bool(waypoints), against)
+            decision = self._first_order(controller, seen, target)
         return Plan(target, focus, seen.state, decision, tuple(waypoints), safe, end, against)
 
-    def _against(self, band: Band, most: float, first: bool) -> str:
-        """Why a waypoint is not safe; empty: it is."""
+    def _against(self, path: Sequence[Waypoint], most: float, spare: Tensor) -> str:
+        """Why the last of some waypoints is not safe; empty: it is.
+
+        Args:
+            spare: ``mu_s f_n - |f_t|`` of each pad before the first [N].
+        """
+        band, piece, first = path[-1].band, path[-1].piece, len(path) == 1
         off = self._off(band, most + (self.margin if first else 0.0))
         if off or first or band.force is None or band.force_std is None:
             return off
         low = (band.force - self.deviations * band.force_std).nan_to_num(nan=math.inf)
-        return f"a finger may keep only {float(low.min()):.1f} N" if bool((low < self.force).any()) else ""
+        if bool((low < self.force).any()):
+            return f"a finger may keep only {float(low.min()):.1f} N"
+        if piece.margin is None:
+            return ""
+        # one deviation, for one finger that slides loses no object
+        least = torch.minimum(piece.linearization.contacts.friction.mean() * band.force_std, spare)
+        slides = (piece.margin < least) & ~band.force.isnan()
+        return "a finger may slide" if bool(slides.any()) else ""
 
     def _off(self, band: Band, most: float) -> str:
         off = band.off + self.deviations * band.off_std
@@ -236,8 +249,7 @@ class WholeTurn:
             if not waypoints and not _loose(rehearsal.first, firm):
                 return None
             waypoint = Waypoint(piece, state, bands.add(piece, state))
-            loosens = _loosens(seen, piece)
-            if len(waypoints) == _GRIP or loosens or self._off(waypoint.band, self.off_rotation):
+            if len(waypoints) == _GRIP or self._off(waypoint.band, self.off_rotation):
                 break
             waypoints.append(waypoint)
         if waypoints:
@@ -248,31 +260,20 @@ class WholeTurn:
         loose = decision.status is StopReason.RUNNING and _loose(decision, firm)
         return dataclasses.replace(decision, turns=False) if loose else None
 
-    def _one_step(
-        self,
-        controller: LookAndMoveController,
-        seen: Observation,
-        target: PoseTarget,
-        modelled: bool,
-        against: str,
+    def _first_order(
+        self, controller: LookAndMoveController, seen: Observation, target: PoseTarget
     ) -> Decision:
-        """Where no waypoint is safe, or the model refuses the first piece: one step to first order, if the
-        object stays where it should be. Friction margins are no reason where the model refuses what the hand
-        holds: fingertips that read wrong use them up."""
+        """Where the model refuses the first piece: one step, if the object stays where it should be. Friction
+        margins are no reason there: fingertips that read wrong use them up."""
         decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
         if decision.status is not StopReason.RUNNING:
             return decision
-        lin = decision.pieces[0].linearization
         least = math.inf if decision.grip is None else float(decision.grip.force.min())
         after = controller.focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
-        if modelled and lin.forces.solved and float(lin.forces.relative_margin.min()) <= _HOLDS:
-            why = against or "a finger is at its friction limit"
-        elif least <= self.force:
-            why = against or f"a finger keeps {least:.1f} N"
-        elif after > self.off_rotation:
-            why = against or f"the object is {after / _DEG:.1f} deg off the axis"
-        else:
+        if least > self.force and after <= self.off_rotation:
             return decision
+        off = f"the object is {after / _DEG:.1f} deg off the axis"
+        why = f"a finger keeps {least:.1f} N" if least <= self.force else off
         return controller.none(StopReason.GIVEN_UP, why, decision.desired)
 
 
@@ -292,15 +293,6 @@ def _joined(
         limited=last is not None and last.limited,
         grip=None if first is None else first.grip,
         band=waypoints[-1].band,
-    )
-
-
-def _loosens(seen: Observation, piece: Piece) -> bool:
-    """A piece that is to grip takes force from a finger."""
-    if seen.fingertip_force is None or piece.force is None:
-        return False
-    return bool(
-        ((piece.force < _LOOSENS * seen.fingertip_force) & (seen.fingertip_force > NOISE.pressing)).any()
     )
 
 

@@ -17,7 +17,6 @@ from ..typing import Tensor
 from .decision import Decision, Piece, StopReason
 from .focus import PoseTarget
 from .limiting import LimitingFunction
-from .limits import ActuatorLimit
 from .model_hand import ModelHand
 
 if TYPE_CHECKING:
@@ -28,7 +27,6 @@ _DEG = math.pi / 180
 _THERE = 0.1 * _DEG  # [rad] of the error, as a turn: the path ends
 _MOST = 60  # pieces
 LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is planned when it is there
-_HALVES, _CUT = 3, 0.99  # times that a piece is tried, and share of an actuator's step that cuts it short
 _BENDS = 0.25 * _DEG  # of a piece beyond its linearization: it is chosen once more, about where it leads
 _GRIPPED = 0.95  # of the wanted grip
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
@@ -122,20 +120,16 @@ class Rehearsal:
             hand.command(decision.delta_a)
             if hand.failure is None:
                 f, after = hand.increment - hand.correction, hand.force if self._measures else None
-                yield Piece(lin, decision.delta_a, f, hand.increment, after, hand.said), hand.state
+                made = Piece(lin, decision.delta_a, f, hand.increment, after, hand.said, hand.margin)
+                yield made, hand.state
 
     def _decide(self, here: Observation, force: Tensor | None, lin: Linearization) -> Decision:
         controller, focus = self._controller, self._controller.focus
         target = PoseTarget(here.position, here.rotation) if self._target is None else self._target
         error = target.error(here.state)
         desired = self._limiting(focus.step_scale * (focus.matrix @ error)) / focus.step_scale
-        most = min((x.step for x in controller.limits if isinstance(x, ActuatorLimit)), default=math.inf)
-        for _ in range(_HALVES):
-            seen = controller.situation(lin, here.a, force, error, desired)
-            decision = controller.choose(lin, seen)
-            if float(decision.delta_a.abs().max()) < _CUT * most:
-                break
-            desired = desired / 2  # else the focused pose is served at the expense of grip
+        seen = controller.situation(lin, here.a, force, error, desired)
+        decision = controller.choose(lin, seen)
         found = self.hand.tangent(decision.delta_a) if decision.status is StopReason.RUNNING else None
         if found is None:
             return decision
