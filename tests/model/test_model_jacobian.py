@@ -45,7 +45,7 @@ def crossed(make, angle=0.9, rho=0.008, radius=0.02):
     contacts = c.replace(finger_curvature=cylinder(0.4, rho), object_curvature=cylinder(0.4 + angle, radius))
     grasp = dataclasses.replace(grasp, model=changed(grasp.model, contacts=contacts), contacts=contacts)
     solver = grasp.solver()
-    assert {core.kind for core in solver.surfaces.finger + solver.surfaces.object} == {"line"}
+    assert {core.directions.shape for core in solver.surfaces.finger + solver.surfaces.object} == {(3, 1)}
     return grasp, solver, grasp.equilibrium()
 
 
