@@ -17,7 +17,6 @@ from torch_ekm.description import (
     ContactPad,
     ObjectDescription,
     Shape,
-    list_objects,
     load_hand,
     load_object,
 )
@@ -71,19 +70,6 @@ def turned(x: float, y: float, z: float) -> torch.Tensor:
 
 
 # -- by hand ------------------------------------------------------------------------------------
-
-
-def test_ball_on_a_box_face() -> None:
-    contacts = touch(probe(thing("box"), ball=True), [0.01, 0.02 + 0.015, 0.0])
-    assert contacts.finger == ("pad",)
-    torch.testing.assert_close(contacts.normal[0], torch.tensor([0.0, -1.0, 0.0], dtype=F64))
-    assert float(contacts.gap) == pytest.approx(0.02 - RADIUS)
-    midway = torch.tensor([0.0, (RADIUS + 0.02) / 2, 0.0], dtype=F64)
-    torch.testing.assert_close(contacts.point[0], midway)
-    across = torch.diag(torch.tensor([1.0, 0.0, 1.0], dtype=F64))
-    torch.testing.assert_close(contacts.finger_curvature[0], across / RADIUS)
-    assert not contacts.object_curvature.any()
-    assert contacts.pinned == (False,)
 
 
 def test_capsule_lying_on_a_face_touches_at_its_middle() -> None:
@@ -182,17 +168,32 @@ def coal_distance(obj: ObjectDescription, position: torch.Tensor, rotation: torc
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=150)
+@settings(max_examples=100)
 @given(pose=poses)
-def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
-    """Outside, and while only the surfaces overlap; the crown adds at most half^2/(2 R) = 0.05 mm."""
+def test_gap_is_coals_distance_and_the_point_is_on_both_surfaces(kind: str, pose: tuple[float, ...]) -> None:
+    """Outside, and while only the surfaces overlap; the crown adds at most half^2/(2 R) = 0.05 mm.
+
+    Unit normal, tangent symmetric curvatures >= 0, the point on both surfaces shifted by half the gap.
+    """
     obj = thing(kind)
     position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
     expected = coal_distance(obj, position, rotation)
-    assume(expected > -0.8 * RADIUS)
     contacts = touch(probe_of(kind), position, rotation)
-    sagitta = HALF**2 / (2 * 0.5)
-    assert -1e-7 < float(contacts.gap) - expected < sagitta + 1e-7
+    n, x, gap = contacts.normal[0], contacts.point[0], float(contacts.gap)
+    assert float(n.norm()) == pytest.approx(1.0, abs=1e-9)
+    for K in (contacts.finger_curvature[0], contacts.object_curvature[0]):
+        assert float((K @ n).abs().max()) < 1e-8
+        torch.testing.assert_close(K, K.mT)
+        assert float(torch.linalg.eigvalsh(K).min()) > -1e-9
+    assume(expected > -0.8 * RADIUS)
+    assert -1e-7 < gap - expected < HALF**2 / (2 * 0.5) + 1e-7
+    on_finger = x + gap / 2 * n
+    along = float(on_finger[0].clamp(-HALF, HALF))
+    distance = (on_finger - torch.tensor([along, 0, 0], dtype=F64)).norm()
+    # within the crown: n leans by at most half/R from the perpendicular
+    assert float(distance) == pytest.approx(RADIUS, abs=1e-6)
+    on_object = rotation.mT @ (x - gap / 2 * n - position)
+    assert point_distance(obj.shapes[0])(*on_object.tolist())[0] == pytest.approx(0.0, abs=1e-9)
     # a flat enough crown is no crown
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(torch_ekm.contact.detector, "CROWN_RADIUS", 1e4)
@@ -201,33 +202,8 @@ def test_gap_is_coals_distance(kind: str, pose: tuple[float, ...]) -> None:
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
-@settings(max_examples=100)
-@given(pose=poses)
-def test_invariants(kind: str, pose: tuple[float, ...]) -> None:
-    """Unit normal, tangent symmetric curvatures >= 0, the point on both surfaces shifted by half the gap."""
-    obj = thing(kind)
-    position, rotation = torch.tensor(pose[:3], dtype=F64), turned(*pose[3:])
-    contacts = touch(probe_of(kind), position, rotation)
-    n, x, gap = contacts.normal[0], contacts.point[0], float(contacts.gap)
-    assert float(n.norm()) == pytest.approx(1.0, abs=1e-9)
-    for K in (contacts.finger_curvature[0], contacts.object_curvature[0]):
-        assert float((K @ n).abs().max()) < 1e-8
-        torch.testing.assert_close(K, K.mT)
-        assert float(torch.linalg.eigvalsh(K).min()) > -1e-9
-    on_finger = x + gap / 2 * n
-    along = float(on_finger[0].clamp(-HALF, HALF))
-    distance = (on_finger - torch.tensor([along, 0, 0], dtype=F64)).norm()
-    if gap > -0.8 * RADIUS:
-        # within the crown: n leans by at most half/R from the perpendicular
-        assert float(distance) == pytest.approx(RADIUS, abs=1e-6)
-        on_object = rotation.mT @ (x - gap / 2 * n - position)
-        d, _ = point_distance(obj.shapes[0])(*on_object.tolist())
-        assert d == pytest.approx(0.0, abs=1e-9)
-
-
-@pytest.mark.parametrize("kind", list(SHAPES))
-def test_normals_are_gradients_and_curvature_their_derivative(kind: str) -> None:
-    """``n = grad d``; on a smooth feature ``dn/dx = K_o`` at the surface."""
+def test_curvature_is_the_derivative_of_the_normal(kind: str) -> None:
+    """On a smooth feature ``dn/dx = K_o`` at the surface; normals are gradients, see the signed distance."""
     shape = thing(kind).shapes[0]
     distance = point_distance(shape)
     rng = np.random.default_rng(2)
@@ -235,11 +211,8 @@ def test_normals_are_gradients_and_curvature_their_derivative(kind: str) -> None
     for _ in range(300):
         p = rng.uniform(-0.06, 0.06, 3)
         d, n = distance(*p)
-        h = 1e-6
-        numeric = [(distance(*(p + h * e))[0] - distance(*(p - h * e))[0]) / (2 * h) for e in np.eye(3)]
-        if abs(d) < 1e-3 or d < 0:
+        if d < 1e-3:
             continue  # inside there are ridges
-        np.testing.assert_allclose(numeric, n, atol=1e-5)
         on = p - (d - 1e-7) * np.array(n)  # hardly outside the surface
         principal, sharp = surface_curvature(shape, tuple(on.tolist()), n)
         if sharp:
@@ -263,7 +236,7 @@ def test_the_contact_point_moves_continuously_as_the_finger_tilts(kind: str) -> 
     turn = turned(0, math.pi / 2, 0) if kind in ("cylinder", "capsule") else EYE  # axis parallel to the pad
     depth = {"box": 0.015, "cylinder": 0.02, "sphere": 0.025, "capsule": 0.015}[kind]
     detector = probe_of(kind)
-    tilts = np.linspace(-0.05, 0.05, 401)
+    tilts = np.linspace(-0.05, 0.05, 101)
     points = torch.stack(
         [touch(detector, [0.0, depth + RADIUS, 0.0], turned(0, 0, a) @ turn).point[0] for a in tilts]
     )
@@ -290,15 +263,6 @@ def test_no_jumps_anywhere_outside(kind: str, pose: tuple[float, ...], along: tu
     assert float((after.point - before.point).norm()) < 1e-4
     assert float((after.normal - before.normal).norm()) < 1e-3
     assert float((after.gap - before.gap).abs()) < 1e-6
-
-
-def test_twice_the_same() -> None:
-    detector = probe(load_object("can"))
-    first, _, second = (
-        touch(detector, p, turned(0.1, 0.2, 0.3)) for p in ([0, 0.026, 0], [0, 0.03, 0], [0, 0.026, 0])
-    )
-    assert torch.equal(first.point, second.point)
-    assert torch.equal(first.finger_curvature, second.finger_curvature)
 
 
 @pytest.mark.parametrize("kind", list(SHAPES))
@@ -344,7 +308,7 @@ def pinch(object_name: str, dtype: torch.dtype = F64, **options):
     return detector, q.to(dtype), position.to(dtype), rotation.to(dtype)
 
 
-@pytest.mark.parametrize("name", list_objects()[:6])
+@pytest.mark.parametrize("name", ["box", "toothpaste"])
 def test_every_object_in_the_hand(name: str) -> None:
     detector, q, position, rotation = pinch(name, margin=math.inf)
     contacts = detector(q, position, rotation)

@@ -17,7 +17,7 @@ from torch_ekm.contact.contact_kinematics import (
 )
 from torch_ekm.contact.contact_model import ContactModel, selected_rows
 from torch_ekm.contact.grasp_analysis import analyse
-from torch_ekm.kinematics.se3 import exp, hat
+from torch_ekm.kinematics.se3 import exp
 
 
 def test_contact_frames_are_rotations_with_the_inward_normal_first():
@@ -40,18 +40,6 @@ def test_grasp_matrix_maps_forces_to_the_wrench_about_the_object_point():
         wrench[:3] += C @ f
         wrench[3:] += torch.linalg.cross(kin.lever[i], C @ f) + C[:, 0] * mu[4 * i + 3]
     assert torch.allclose(G @ mu, wrench, atol=1e-15)
-
-
-def test_grasp_matrix_equals_the_adjoint_form_of_murray_li_sastry():
-    # G_i = Ad^T of the inverse contact pose, in object axes; here the object's axes are the hand's
-    kin = held(THREE)
-    G = full_grasp_matrix(kin)
-    for i in range(3):
-        R, p = kin.frame[i], kin.lever[i]
-        adjoint = torch.zeros(6, 6, dtype=F64)  # twist order (v; w) of g_oc^-1
-        adjoint[:3, :3], adjoint[3:, 3:] = R.mT, R.mT
-        adjoint[:3, 3:] = -R.mT @ hat(p)
-        assert torch.allclose(G[:, 6 * i : 6 * i + 6], adjoint.mT, atol=1e-15)
 
 
 def test_constraint_rows_are_the_velocities_of_the_contact_points():

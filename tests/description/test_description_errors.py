@@ -12,26 +12,16 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from own_files import change, copied
 
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.description.transmission_file import document
 from torch_ekm.exceptions import DescriptionError, EKMError, JointMismatchError, UnknownNameError
 
-HAND, BOX = load_hand("planar_two_finger"), load_object("box")
-
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    urdf, transmission = tmp_path / "my.urdf", tmp_path / "my.transmission.toml"
-    urdf.write_text(HAND.urdf_path.read_text())
-    transmission.write_text(HAND.transmission_path.read_text())
-    return urdf, transmission
-
-
-def change(path: Path, old: str, new: str) -> None:
-    text = path.read_text()
-    assert old in text
-    path.write_text(text.replace(old, new, 1))
+    return copied(tmp_path)
 
 
 URDF_FAULTS = {
@@ -76,9 +66,7 @@ EVERYWHERE = ("not a robot", "size", "no shape")  # replaced at each place, not 
 def test_urdf_faults(fault: str, files: tuple[Path, Path]) -> None:
     old, new, message = URDF_FAULTS[fault]
     urdf, _ = files
-    text = urdf.read_text()
-    assert old in text
-    urdf.write_text(text.replace(old, new, -1 if fault in EVERYWHERE else 1))
+    change(urdf, old, new, -1 if fault in EVERYWHERE else 1)
     with pytest.raises(DescriptionError, match=message) as caught:
         load_hand(urdf)
     assert str(urdf) in str(caught.value)
@@ -186,26 +174,17 @@ OBJECT_FAULTS = {
 @pytest.mark.parametrize("fault", list(OBJECT_FAULTS))
 def test_object_faults(fault: str, tmp_path: Path) -> None:
     suffix, old, new, message = OBJECT_FAULTS[fault]
-    urdf, side = tmp_path / "thing.urdf", tmp_path / "thing.object.toml"
-    urdf.write_text(BOX.urdf_path.read_text())
-    side.write_text(BOX.urdf_path.with_suffix(".object.toml").read_text())
-    path = tmp_path / f"thing{suffix}"
-    text = path.read_text()
-    assert old in text
-    path.write_text(
-        text.replace(old, new) if fault in ("massless", "no shape") else text.replace(old, new, 1)
-    )
+    urdf, _ = copied(tmp_path, "box")
+    change(tmp_path / f"my{suffix}", old, new, -1 if fault in ("massless", "no shape") else 1)
     with pytest.raises(DescriptionError, match=message):
         load_object(urdf)
 
 
 def test_a_hall_channel_is_read_once(tmp_path: Path) -> None:
-    icub = load_hand("icub_right")
-    (tmp_path / "my.urdf").write_text(icub.urdf_path.read_text())
-    text = icub.transmission_path.read_text()
-    (tmp_path / "my.transmission.toml").write_text(text.replace("channel = 1\n", "channel = 0\n"))
+    urdf, transmission = copied(tmp_path, "icub_right")
+    change(transmission, "channel = 1\n", "channel = 0\n")
     with pytest.raises(DescriptionError, match="each Hall channel must be unique, repeated: 0"):
-        load_hand(tmp_path / "my.urdf")
+        load_hand(urdf)
 
 
 JUNK = ["", "nan", "-1", "0", "1e999", "[]", "{}", '"x"', "<", "&", "true", "[[pads]]", "\x00", "é", "left_0"]
@@ -216,14 +195,11 @@ JUNK = ["", "nan", "-1", "0", "1e999", "[]", "{}", '"x"', "<", "&", "true", "[[p
 def test_damaged_files_never_raise_anything_else(which: bool, at: float, junk: str) -> None:
     """One word of either file replaced by junk: the hand loads, or the error is ours."""
     with tempfile.TemporaryDirectory() as folder:
-        urdf, transmission = Path(folder, "my.urdf"), Path(folder, "my.transmission.toml")
-        texts = {urdf: HAND.urdf_path.read_text(), transmission: HAND.transmission_path.read_text()}
+        urdf, transmission = copied(Path(folder))
         damaged = urdf if which else transmission
-        words = re.split(r"(\W)", texts[damaged])
+        words = re.split(r"(\W)", damaged.read_text(encoding="utf-8"))
         words[int(at * len(words))] = junk
-        texts[damaged] = "".join(words)
-        for path, text in texts.items():
-            path.write_text(text, encoding="utf-8")
+        damaged.write_text("".join(words), encoding="utf-8")
         with contextlib.suppress(EKMError):
             load_hand(urdf)
 

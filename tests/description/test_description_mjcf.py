@@ -248,7 +248,6 @@ def mjcf(body: str = WORLD.format(more=""), rest: str = ACTUATOR) -> str:
 
 REFUSED = {
     "slides": (mjcf(WORLD.format(more='type="slide"')), "no hinge joint; .* held: j"),
-    "ball": (mjcf(WORLD.format(more='type="ball"'), ""), "no hinge joint; .* held: j"),
     "no joint": (mjcf("<geom size='.1'/>", ""), "no hinge joint"),
     "no actuator": (mjcf(rest=""), r"\[\[actuators\]\]: at least 1"),
     "loop": (mjcf(rest=ACTUATOR + "<equality><weld body1='b'/></equality>"), "welds bodies"),
@@ -261,21 +260,10 @@ REFUSED = {
     ),
     "outside": ("<mujoco><include file='../other.xml'/></mujoco>", r"no hinge.*outside .*\.\./other\.xml"),
     "absolute": ("<mujoco><include file='/etc/hostname'/></mujoco>", "no hinge.*outside .*/etc/hostname"),
-    "itself": ("<mujoco><include file='hand.xml'/></mujoco>", "includes this file"),
     "nothing": ("<mujoco><include/></mujoco>", "has no file"),
     "not there": ("<mujoco><include file='gone.xml'/></mujoco>", "no such MJCF file"),
     "huge": ("<mujoco>" + "<!-- x -->" * 500_000 + "</mujoco>", "at most .* bytes"),
     "many": (mjcf("<body/>" * 30_000), "at most 20000 elements"),
-    "entities": (
-        "<!DOCTYPE x [<!ENTITY a 'aaaaaaaaaa'>"
-        + "".join(f"<!ENTITY {b} '{f'&{a};' * 10}'>" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
-        + "]><mujoco model='&i;'/>",
-        "not well-formed XML: limit on input amplification",
-    ),
-    "a file of the system": (
-        "<!DOCTYPE x [<!ENTITY a SYSTEM 'file:///etc/hostname'>]><mujoco model='&a;'/>",
-        "not well-formed XML",
-    ),
 }  # fmt: skip
 
 

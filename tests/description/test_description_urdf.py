@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from own_files import change, copied
 
 from torch_ekm.description import load_hand
 from torch_ekm.description.urdf import read_urdf
@@ -60,14 +61,11 @@ def test_meshes_are_accepted_and_never_opened(tmp_path: Path) -> None:
 
 def test_a_hand_of_meshes_loads(tmp_path: Path) -> None:
     """Its contacts come from pads, which the transmission file gives."""
-    hand = load_hand("planar_two_finger")
-    text = hand.urdf_path.read_text()
+    urdf, _ = copied(tmp_path)
     for shape in ("box", "cylinder", "sphere"):
-        text = text.replace(f"<{shape} ", '<mesh filename="a.stl" ')
-    (tmp_path / "a.urdf").write_text(text)
-    (tmp_path / "a.transmission.toml").write_text(hand.transmission_path.read_text())
-    meshes = load_hand(tmp_path / "a.urdf")
-    assert meshes.pads == hand.pads
+        change(urdf, f"<{shape} ", '<mesh filename="a.stl" ', -1)
+    meshes = load_hand(urdf)
+    assert meshes.pads == load_hand("planar_two_finger").pads
     assert all(link.has_mesh for link in meshes.urdf.links if not link.name.endswith("tip"))
 
 

@@ -68,25 +68,18 @@ def test_joints_without_a_sensor_rest_where_the_springs_have_them(driver) -> Non
     torch.testing.assert_close(other.observe().q, radians(0.1, 0.2, 0.3, 0.4))  # as they read
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_command_beyond_the_limits_is_refused_and_nothing_is_sent(driver) -> None:
-    for wrong, error in (
-        (radians(0.0, 30 * DEG), CommandRefusedError),
-        (radians(0.0, math.nan), NonFiniteError),
-    ):
-        with pytest.raises(error):
-            driver.command(wrong)
+    with pytest.raises(NonFiniteError):
+        driver.command(radians(0.0, math.nan))
+    with pytest.raises(ShapeError, match="left, right"):
+        driver.command(radians(0.1))
     with pytest.raises(CommandRefusedError, match=r"motor 'right': a command of 30 deg.*increment.* 20 deg"):
         driver.command(radians(0.0, 30 * DEG))
     driver.motors = driver.motors.__class__([1000 + 600 * 220 * DEG, 2400.0], 1.0)
     with pytest.raises(CommandRefusedError, match=r"reads 220 deg, its range is -68.6 to 191 deg.*:15\)"):
         driver.command(radians(0.01, 0.0))
     assert not driver.written
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_a_command_of_another_length(driver) -> None:
-    with pytest.raises(ShapeError, match="left, right"):
-        driver.command(radians(0.1))
 
 
 def test_goals_stay_in_the_range_and_are_never_turned_round(driver) -> None:

@@ -28,7 +28,6 @@ from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
 
 DEG = math.pi / 180
 TICK = 2 * math.pi / 4096
-STUFFED = -0x20001  # FF FF FD FF on the bus
 
 
 @pytest.fixture
@@ -61,15 +60,6 @@ def test_a_motion_over_the_bus(bus, tmp_path) -> None:
         plant.observe()  # a sync write has no answer: what comes after it has
         assert left[98] == 0  # at rest no watchdog
     assert not plant._port.open
-
-
-def test_stuffed_bytes_arrive(bus, tmp_path) -> None:
-    with open_at(bus, tmp_path) as plant:
-        plant._write([STUFFED, 5], 0.0)
-        plant._read()  # a sync write has no answer: what comes after it has
-        assert bus.goals[-1] == [float(STUFFED), 5.0]
-        bus.motors = Motors([STUFFED, 5.0], 1.0)
-        assert plant._read().motors == [STUFFED, 5]
 
 
 def test_a_servo_that_is_lost_is_named_with_its_line(bus, tmp_path) -> None:

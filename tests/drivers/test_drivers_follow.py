@@ -11,7 +11,7 @@ import pytest
 import torch
 from motors import Motors
 from no_bus import FakeDriver
-from test_drivers_yarp import ICUB, increment
+from test_drivers_yarp import increment
 from test_drivers_yarp import wiring as yarp_wiring
 from wirings import write
 from yarp_golden import GoldenYarp
@@ -195,25 +195,6 @@ def test_dynamixel_completes_and_stops(servos) -> None:
     assert bus.tables[1][98] == 0  # at rest no watchdog
 
 
-def test_a_dynamixel_bus_that_dies_on_the_way_leaves_motors_that_stand(servos) -> None:
-    bus, plant = servos
-    asked = []
-
-    def watch(seen) -> bool:
-        asked.append(seen)
-        if len(asked) == 3:
-            bus.silent = {1, 2}
-        return True
-
-    with pytest.raises(BusError, match="no answer"):
-        plant.follow(way((20, -20), (40, -40)), watch)
-    time.sleep(0.2)
-    here = bus.motors.now()
-    time.sleep(0.05)
-    assert bus.motors.now() == here
-    assert here[0] < 1600 + 35 / 360 * 4096
-
-
 @pytest.fixture
 def icub(tmp_path):
     network = GoldenYarp()
@@ -229,19 +210,3 @@ def proximal(*degrees: float) -> Path:
 def test_yarp_completes_and_stops(icub) -> None:
     _, plant = icub
     check_following_plant(plant, proximal(12, 20), tolerance=0.5 * DEG)
-
-
-def test_a_yarp_port_that_dies_on_the_way_is_named(icub) -> None:
-    network, plant = icub
-    asked = []
-
-    def watch(seen) -> bool:
-        asked.append(seen)
-        if len(asked) == 3:
-            network.close()
-        return True
-
-    with pytest.raises(BusError, match="right_arm"):
-        plant.follow(proximal(12, 24, 12), watch)
-    k = ICUB.actuator_names.index("index_proximal")
-    assert network.motors.now()[k] < 45 + 20

@@ -7,19 +7,22 @@ import functools
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from own_files import change, copied
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.control import ClosedLoop
 from torch_ekm.description import list_hands, load_hand, load_object
-from torch_ekm.exceptions import DescriptionError, EquilibriumError, GraspError
+from torch_ekm.exceptions import GraspError
 from torch_ekm.inspection import check as module
 from torch_ekm.inspection.check import check_hand
 from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 from torch_ekm.simulation.grasp_planning import pinch
+from torch_ekm.simulation.grasp_planning.doctor import Cure
 from torch_ekm.simulation.grasp_planning.pinch import pinch_problem
 from torch_ekm.simulation.grasp_planning.requirements import unmet
 
@@ -32,10 +35,7 @@ SMALL_TURNS = functools.partialmethod(ClosedLoop.reach, limit=math.radians(5.0))
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    urdf, transmission = tmp_path / "my.urdf", tmp_path / "my.transmission.toml"
-    urdf.write_text(HAND.urdf_path.read_text())
-    transmission.write_text(HAND.transmission_path.read_text())
-    return urdf, transmission
+    return copied(tmp_path)
 
 
 @pytest.fixture
@@ -84,7 +84,7 @@ FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and t
 
 
 #: Their rows come before the pinch, which other tests plan with springs and actuators like theirs.
-NO_PINCH = ("never taut", "rigid")
+NO_PINCH = ("never taut", "late", "rigid")
 
 
 @pytest.mark.usefixtures("brief")
@@ -93,37 +93,28 @@ def test_each_fault_has_its_row(fault, files, monkeypatch):
     if fault in NO_PINCH:
         monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "not tried")])
     which, old, new, name, state, text = FAULTS[fault]
-    content = files[which].read_text()
-    assert old in content
-    content = content.replace(old, new, -1 if fault == "limits" else 1)
+    change(files[which], old, new, -1 if fault == "limits" else 1)
     if fault == "one pad":
-        content = content[: content.rindex("[[pads]]")]
-    files[which].write_text(content)
+        content = files[which].read_text()
+        files[which].write_text(content[: content.rindex("[[pads]]")])
     rows = [row for row in check_hand(str(files[0])) if row.name == name]
     assert [row.state for row in rows] == [state]
     assert re.search(text, rows[0].found)
     assert bool(rows[0].remedy) == (state != "ok")
 
 
-def test_a_pad_that_the_urdf_lacks_is_printed_to_be_pasted(files):
+def test_a_pad_that_the_urdf_lacks_is_printed_to_be_pasted(files, monkeypatch):
     urdf, transmission = files
-    transmission.write_text(transmission.read_text().replace("radius = 0.006", "radius = 0.009", 1))
-    (row,) = [row for row in module._pads(load_hand(urdf)) if row.state != "ok"]
+    change(transmission, "radius = 0.006", "radius = 0.009")
+    rows = list(module._pads(load_hand(urdf)))
+    (row,) = [row for row in rows if row.state != "ok"]
     pasted = row.remedy[row.remedy.index("<collision>") :]
     link = f'<link name="{load_hand(urdf).pads[0].link}">'
     text = re.sub(r"<collision>.*?</collision>", "", urdf.read_text(), flags=re.DOTALL)
     urdf.write_text(text.replace(link, link + pasted))
     assert next(module._pads(load_hand(urdf))).state == "ok"
-
-
-def test_what_is_pasted_is_printed_on_one_line(files, monkeypatch):
-    urdf, transmission = files
-    transmission.write_text(transmission.read_text().replace("radius = 0.006", "radius = 0.009", 1))
-    rows = list(module._pads(load_hand(urdf)))
     monkeypatch.setattr(module, "check_hand", lambda *_: rows)
-    said = CliRunner().invoke(app, ["check", str(urdf)])
-    (row,) = [row for row in rows if row.remedy]
-    assert row.remedy[row.remedy.index("<collision>") :] in said.output.splitlines()
+    assert pasted in CliRunner().invoke(app, ["check", str(urdf)]).output.splitlines()  # on one line
 
 
 UNITS = {"rad": ("range_deg", "range"), "m": ("left_0 = 1.0, left_1 = 0.8", "left_0 = 0.010, left_1 = 0.008")}
@@ -133,10 +124,7 @@ UNITS = {"rad": ("range_deg", "range"), "m": ("left_0 = 1.0, left_1 = 0.8", "lef
 def test_ranges_and_moment_arms_in_another_unit_are_named(unit, files):
     urdf, transmission = files
     assert not list(module._ranges(load_hand(urdf)))
-    old, new = UNITS[unit]
-    text = transmission.read_text()
-    assert old in text
-    transmission.write_text(text.replace(old, new, 1))
+    change(transmission, *UNITS[unit])
     (row,) = module._ranges(load_hand(urdf))
     assert (row.name, row.state) == ("range of 'left'", "warning")
     assert "are ratios of radii" in row.remedy
@@ -157,12 +145,12 @@ def test_where_the_files_have_a_fault_no_other_figure_is_tried(files, monkeypatc
     urdf, transmission = files
     assert "collision shapes" not in {row.name for row in check_hand(str(urdf), "can")}
     assert len(tried) == 1
-    as_it_was = transmission.read_text()
-    transmission.write_text(as_it_was.replace("radius = 0.006", "radius = 0.009", 1))
+    change(transmission, "radius = 0.006", "radius = 0.009")
     (row,) = [row for row in check_hand(str(urdf), "can") if row.name == "collision shapes"]
     assert "paste the <collision> of pad 'left'" in row.remedy
     assert len(tried) == 1
-    transmission.write_text(as_it_was.replace("[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]", 1))
+    change(transmission, "radius = 0.009", "radius = 0.006")
+    change(transmission, "[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]")
     check_hand(str(urdf), "can")
     assert len(tried) == 1
 
@@ -175,18 +163,6 @@ def test_which_pad_opposes_which_is_said():
 def test_a_xacro_file_is_told_which_command_comes_first(tmp_path):
     (row,) = check_hand(str(tmp_path / "my.urdf.xacro"))
     assert row.found.endswith(f"xacro {tmp_path}/my.urdf.xacro > {tmp_path}/my.urdf")
-
-
-@pytest.mark.usefixtures("brief")
-def test_a_planner_that_fails_names_the_joint_and_not_the_object():
-    narrow = HAND.joint_upper.copy()
-    narrow[HAND.joint_names.index("left_0")] = narrow[HAND.joint_names.index("right_0")] = -0.3
-    narrow[HAND.joint_names.index("left_1")] = narrow[HAND.joint_names.index("right_1")] = 0.2
-    hand = dataclasses.replace(HAND, joint_upper=narrow)
-    with pytest.raises((EquilibriumError, GraspError), match=r"joint '(left|right)_0': no posture"):
-        SimulatedHand(hand, "box").reset(0)
-    with pytest.raises(DescriptionError, match=r"two .*pads"):
-        SimulatedHand(dataclasses.replace(HAND, pads=HAND.pads[:1]), "box")
 
 
 def test_the_joint_in_the_way_is_the_one_that_was_narrowed():
@@ -213,42 +189,31 @@ def test_a_pad_that_holds_with_its_back_is_told(monkeypatch):
     assert "'right'" in rows["contact sides"].found
 
 
-def test_a_pinch_that_turns_little_is_told(monkeypatch):
-    can = load_object("can")
-
-    found = {}
-
-    def reach_once(loop, *, sign):
-        if sign not in found:
-            found[sign] = reach(loop, sign=sign)
-        return found[sign]
-
-    reach = ClosedLoop.reach
-    monkeypatch.setattr(ClosedLoop, "reach", reach_once)
-
-    def turn(least_deg: float) -> tuple[str, list[int]]:
-        monkeypatch.setattr(module, "_LITTLE_TURN", math.radians(least_deg))
-        (row,) = module._turn(HAND, can)
-        return row.state, [int(angle) for angle in re.findall(r"([+-]\d+) deg", row.found)]
-
-    state, (back, forth) = turn(3.0)
-    assert (state, back < 0 < forth) == ("ok", True)
-    assert turn(min(-back, forth) + 2.0)[0] == "warning"
-    assert turn(min(-back, forth) - 2.0)[0] == "ok"
+@pytest.mark.parametrize(("most", "state"), [(3.4, "ok"), (2.6, "warning")])
+def test_a_pinch_that_turns_little_is_told(most, state, monkeypatch):
+    """At least 3 deg either way."""
+    monkeypatch.setattr(module, "_LITTLE_TURN", math.radians(3.0))
+    turns = {-1: -math.radians(9.0), 1: math.radians(most)}
+    monkeypatch.setattr(ClosedLoop, "reach", lambda _, sign: SimpleNamespace(angle=turns[sign], end="end"))
+    (row,) = module._turn(HAND, load_object("can"))
+    assert (row.state, row.found) == (state, "predicted: -9 deg (end), +3 deg (end)")
 
 
 @pytest.mark.usefixtures("brief")
-def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monkeypatch):
+def test_springs_too_soft_for_the_usual_force_are_told_what_holds(monkeypatch):
+    """Which changes those are: tests/simulation/test_simulation_doctor.py."""
     hand = dataclasses.replace(HAND, spring_stiffness=HAND.spring_stiffness / 4)
+
+    def found(soft, can, config, parameters) -> Cure:
+        assert soft.spring_stiffness[0] == hand.spring_stiffness[0]
+        return Cure(["a pinch_force of 1.2 N", "an arm of 2"], soft.spring_rest)
+
     monkeypatch.setattr(module, "load_hand", lambda _: hand)
+    monkeypatch.setattr(module, "smallest_changes", found)
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["limits"].state == "ok"
     assert "the fingertips reach it; torque is to blame: joint" in rows["pinch"].found
-    force = re.search(r"a pinch_force of ([\d.]+) N", rows["smallest change"].found)
-    assert force is not None
-    gentle = dataclasses.replace(hand, pinch_force=float(force[1]))
-    rows = {row.name: row for row in module._pinch(gentle, load_object("can"), None, PlantConfig())}
-    assert rows["pinch"].state == "ok"
+    assert rows["smallest change"].found == "the pinch holds with a pinch_force of 1.2 N; or an arm of 2"
 
 
 def test_a_planned_pinch_that_is_lost_is_told_with_forces_and_distance(monkeypatch):

@@ -70,51 +70,6 @@ def test_free_motion_is_an_equilibrium(name: str) -> None:
     torch.testing.assert_close(slope, change.sum(0), atol=1e-8, rtol=0)
 
 
-def test_icub_splits_evenly() -> None:
-    """a/2 per distal joint, a/3 per ring or little joint, (60 deg - a)/3 per abduction: iKin's split."""
-    hand = rigid("icub_right")
-    actuation = ActuationMap(hand)
-    a_deg = {
-        "hand_finger": 33.0,
-        "thumb_oppose": 40.0,
-        "thumb_distal": 50.0,
-        "index_distal": 70.0,
-        "pinky": 90.0,
-    }
-    a = torch.tensor(
-        [math.radians(a_deg.get(name, 0.0)) for name in hand.actuator_names], dtype=torch.float64
-    )
-    q = dict(zip(hand.joint_names, torch.rad2deg(actuation.joints(a)).tolist(), strict=True))
-    expected = {
-        "thumb_0": 40.0,
-        "thumb_1": 0.0,
-        "thumb_2": 25.0,
-        "thumb_3": 25.0,
-        "index_2": 35.0,
-        "index_3": 35.0,
-    }
-    expected |= {f"{finger}_{k}": 30.0 for finger in ("ring", "little") for k in (1, 2, 3)}
-    expected |= {f"{finger}_0": 9.0 for finger in ("index", "ring", "little")} | {"middle_0": 0.0}
-    for joint, angle in expected.items():
-        assert q[joint] == pytest.approx(angle, abs=1e-9), joint
-
-
-def test_icub_hand_finger() -> None:
-    """hand_finger: 60 deg together, 0 deg spread by 20 deg each."""
-    actuation = ActuationMap(load_hand("icub_right"))
-    q = torch.zeros(20, dtype=torch.float64)
-    assert math.degrees(float(actuation.actuators(q)[0])) == pytest.approx(60.0)
-    q[[4, 12, 16]] = math.radians(20)
-    assert math.degrees(float(actuation.actuators(q)[0])) == pytest.approx(0.0, abs=1e-9)
-
-
-def test_planar_by_hand() -> None:
-    """Springs 0.2 and 0.1, arms 1 and 0.8: ``q = a K^-1 J^T/(J K^-1 J^T) = a (5, 8)/11.4``."""
-    actuation = ActuationMap(rigid("planar_two_finger"), dtype=torch.float32)
-    q = actuation.joints(torch.tensor([1.14, 0.57]))
-    torch.testing.assert_close(q, torch.tensor([0.5, 0.8, 0.25, 0.4]))
-
-
 def test_errors() -> None:
     actuation = ActuationMap(load_hand("planar_two_finger"))
     with pytest.raises(ShapeError, match="left, right"):
@@ -122,3 +77,5 @@ def test_errors() -> None:
     with pytest.raises(ShapeError, match="left_0, left_1"):
         actuation.actuators(torch.zeros(2, dtype=torch.float64))
     assert "joints=4" in repr(actuation)
+    single = ActuationMap(load_hand("planar_two_finger"), dtype=torch.float32)
+    assert single.joints(torch.zeros(2)).dtype == torch.float32

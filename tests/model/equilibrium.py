@@ -35,8 +35,6 @@ class Equilibrium:
     stop: Float[Tensor, " n_k"]
     """Torques on held joints [N m]."""
     contacts: ContactSet
-    residual: float
-    """Largest entry of the scaled equations that were solved."""
 
 
 class EquilibriumSolver:
@@ -52,32 +50,21 @@ class EquilibriumSolver:
 
     The contact points are exact functions of the state (:class:`TrackedContacts`). Rolling in space is not
     holonomic, so the answer depends on the path from the first configuration: large moves are cut into steps
-    of at most ``max_step``, whose midpoint rule leaves an error of third order. Newton's matrix is the
-    model's stiffness D; only the speed of convergence depends on it, not the answer.
-
-    Args:
-        model: gives hand, object and options (contacts are taken as rolling whatever the options say).
-        state: a configuration with the fingers in contact.
-        contacts: its contacts; by default from the model's detector.
-        held: joints that do not move (at a stop), by index.
-        max_step: largest change of an actuator in one continuation step [rad].
-        tolerance: on the scaled equations (N m, rad).
+    of at most ``max_step`` [rad of an actuator], whose midpoint rule leaves an error of third order. Newton's
+    matrix is the model's stiffness D; only the speed of convergence depends on it, not the answer. ``held``
+    joints, by index, do not move: they are at a stop.
     """
 
     def __init__(
         self,
         model: KinematicModel,
         state: GraspState,
-        contacts: ContactSet | None = None,
+        contacts: ContactSet,
         *,
         held: tuple[int, ...] = (),
         max_step: float = 0.02,
-        tolerance: float = 1e-12,
-        max_iterations: int = 60,
     ) -> None:
         self.model, self.held, self.max_step = model, list(held), max_step
-        self.tolerance, self.max_iterations = tolerance, max_iterations
-        contacts = model.contacts(state) if contacts is None else contacts
         links = [model.link_names.index(name) for name in contacts.link]
 
         def link_pose(q: Tensor) -> Tensor:
@@ -97,45 +84,29 @@ class EquilibriumSolver:
         return self.offset + self.model.reduction.actuation @ state.q
 
     @torch.no_grad()
-    def find(
-        self,
-        normal_force: Float[Tensor, " n_c"] | None = None,
-        *,
-        forces: GraspForces | None = None,
-        normal_std: float = 0.05,
-        steps: int = 8,
-    ) -> Equilibrium:
-        """An equilibrium near the first configuration, with normal forces near those wished for.
+    def find(self, normal_force: Float[Tensor, " n_c"]) -> Equilibrium:
+        """An equilibrium near the first configuration, with normal forces near those wished for [N].
 
         Starts from the relaxed forces there; the joint torques that they leave unexplained are then faded
         out, the actuators staying where they are.
-
-        Args:
-            normal_force: wished normal forces [N].
-            forces: start from these in place of the relaxed ones.
-            normal_std: how much a wish may be missed [N]; small: rather leave torque to fade out.
-            steps: of the fading.
-
-        Raises:
-            EquilibriumError: no forces balance the object, or Newton fails on the way.
         """
-        if forces is None:
-            forces = self._forces(normal_force, normal_std)
-        if not forces.solved:
-            raise EquilibriumError(
-                "newton", f"no forces balance the object at the start: {forces.status[0].value}"
-            )
+        model = self.model
         _, kin = self._geometry(self.start)
+        options = dataclasses.replace(model.options.forces, normal_std=0.05)
+        balance = _NoStops(model.hand, dataclasses.replace(model.options, forces=options), model.reduction)
+        at = self.start.q, kin, constraint_matrix(kin), model.potential(self.start)[0]
+        forces = balance(*at, normal=normal_force)
+        assert forces.solved
         stop = forces.stop_torque[self.held]
         a = self.actuators(self.start) - self.compliance * forces.lam
-        at = Equilibrium(self.start, a, forces.mu, forces.lam, stop, kin.contacts, float("inf"))
+        at = Equilibrium(self.start, a, forces.mu, forces.lam, stop, kin.contacts)
         unexplained = self._balance(at.state, kin, at.mu, at.lam, at.stop)
         gap = kin.contacts.gap
 
         def faded(at: Equilibrium, done: float) -> Equilibrium:
             return self._newton(at, a, (1 - done) * unexplained, (1 - done) * gap)
 
-        return _follow(at, faded, steps)
+        return _follow(at, faded, 8)
 
     @torch.no_grad()
     def move(self, start: Equilibrium, a: Float[Tensor, " n_a"]) -> Equilibrium:
@@ -156,51 +127,26 @@ class EquilibriumSolver:
         return self._moved[key][1]
 
     @torch.no_grad()
-    def grip(
-        self,
-        start: Equilibrium,
-        normal_force: Float[Tensor, " n_c"],
-        *,
-        tolerance: float = 1e-6,
-        max_rounds: int = 40,
-    ) -> Equilibrium:
-        """Move the actuators, as little as possible, until the normal forces are those wished for.
+    def grip(self, start: Equilibrium, normal_force: Float[Tensor, " n_c"]) -> Equilibrium:
+        """Move the actuators, as little as possible, until the normal forces are those wished for [N].
 
-        Newton with ``d f_n/da`` of the model; the object moves along.
-
-        Args:
-            start: an equilibrium.
-            normal_force: wished normal forces [N]; a NaN leaves that contact free.
-            tolerance: largest miss [N].
-
-        Raises:
-            EquilibriumError: not reached (three point contacts can hold only certain combinations).
+        Newton with ``d f_n/da`` of the model; the object moves along. A NaN leaves that contact free.
         """
         at, known = start, torch.isfinite(normal_force)
-        for _ in range(max_rounds):
+        for _ in range(40):
             forces = self.forces(at)
             miss = (normal_force - forces.normal)[known]
-            if float(miss.abs().max()) <= tolerance:
+            if float(miss.abs().max()) <= 1e-6:
                 return at
             lin = self.model.linearize(at.state, at.contacts, forces=forces)
             da = torch.linalg.pinv(lin.normal_force_sensitivity[known], rtol=1e-4) @ miss
-            da = da * min(1.0, 0.1 / float(da.abs().max()))
-            at = self.move(at, at.a + da)
+            at = self.move(at, at.a + da * min(1.0, 0.1 / float(da.abs().max())))
         raise EquilibriumError("grip", f"normal forces missed by {float(miss.abs().max()):.2g} N")
 
     def forces(self, at: Equilibrium) -> GraspForces:
         """The exact forces of an equilibrium, in the form that :meth:`KinematicModel.linearize` takes."""
         kin = self.model.contact_kinematics(at.state, at.contacts, rolling=True)
         return known_forces(kin, at.mu, at.lam)
-
-    def _forces(self, wish: Tensor | None, std: float) -> GraspForces:
-        model = self.model
-        _, kin = self._geometry(self.start)
-        A = constraint_matrix(kin)
-        at = self.start.q, kin, A, model.potential(self.start)[0]
-        forces = dataclasses.replace(model.options.forces, normal_std=std)
-        options = dataclasses.replace(model.options, forces=forces)
-        return _Balance(model.hand, options, model.reduction, held=self.held)(*at, normal=wish)
 
     def _geometry(self, state: GraspState) -> tuple[ContactSet, ContactKinematics]:
         contacts = self.surfaces(state.q, state.position, state.rotation)
@@ -224,7 +170,7 @@ class EquilibriumSolver:
         E_h = Z[:n_q][self.held]
         before = self.surfaces.pinned_offset(at.state.q, at.state.position, at.state.rotation)
         best, stalled = float("inf"), 0
-        for _ in range(self.max_iterations):
+        for _ in range(60):
             contacts, kin = self._geometry(state)
             A_s = constraint_matrix(kin)
             closing = self._closing(kin, at.state, state, before, gap)
@@ -242,8 +188,8 @@ class EquilibriumSolver:
             size = float(error.abs().max())
             if not size < 1e6:
                 break
-            if size < self.tolerance or (size < 100 * self.tolerance and size >= 0.5 * best):
-                return Equilibrium(state, a, mu, lam, stop, contacts, size)
+            if size < 1e-12 or (size < 1e-10 and size >= 0.5 * best):
+                return Equilibrium(state, a, mu, lam, stop, contacts)
             stalled = stalled + 1 if size > 0.9 * best else 0
             best = min(best, size)
             if stalled > 12:
@@ -333,13 +279,6 @@ def known_forces(kin: ContactKinematics, mu: Tensor, lam: Tensor) -> GraspForces
     )
 
 
-class _Balance(ForceBalance):
-    """With held joints, whose torque is free."""
-
-    def __init__(self, *args, held: list[int]) -> None:
-        super().__init__(*args)
-        self.held = held
-
+class _NoStops(ForceBalance):
     def _bounded(self, q):
-        joints = self.held
-        return joints, np.full(len(joints), -np.inf), np.full(len(joints), np.inf)
+        return [], np.zeros(0), np.zeros(0)

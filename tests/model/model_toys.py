@@ -8,13 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from equilibrium import Equilibrium, EquilibriumSolver, known_forces
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.contact.contact_kinematics import constraint_matrix
+from torch_ekm.contact.contact_set import SHARED, VARYING, ContactSet
 from torch_ekm.description import Actuator, HandDescription
 from torch_ekm.description.urdf import UrdfModel
-from torch_ekm.kinematics import LinkPoses, se3
+from torch_ekm.kinematics import GraspState, LinkPoses, se3
+from torch_ekm.model import KinematicModel
+from torch_ekm.model.stiffness.potential import gravity_gradient
 
 F64 = torch.float64
 
@@ -23,6 +27,7 @@ class ChainKinematics(nn.Module):
     """Fingers of revolute joints: (origin relative to the predecessor, axis) of each."""
 
     dtype = F64
+    upstream: torch.Tensor
 
     def __init__(self, fingers: list[list[tuple[np.ndarray, np.ndarray]]]):
         super().__init__()
@@ -35,14 +40,8 @@ class ChainKinematics(nn.Module):
             torch.stack([joint[k] for finger in self.fingers for joint in finger]) for k in range(2)
         )
         self.link_names = tuple(f"f{i}_l{j}" for i, finger in enumerate(fingers) for j in range(len(finger)))
-        n_q = len(self.link_names)
-        upstream = torch.zeros(n_q, n_q, dtype=torch.bool)
-        at = 0
-        for finger in fingers:
-            for j in range(len(finger)):
-                upstream[at + j, at : at + j + 1] = True
-            at += len(finger)
-        self.register_buffer("upstream", upstream)
+        lower = [torch.ones(n, n, dtype=torch.bool).tril() for n in self.lengths]
+        self.register_buffer("upstream", torch.block_diag(*lower))
 
     def forward(self, q):
         turns = torch.zeros(*q.shape, 4, 4, dtype=F64)
@@ -63,25 +62,15 @@ class ChainKinematics(nn.Module):
 
 @dataclass(frozen=True)
 class ToyObject:
+    """An object's inertia; its surfaces are in the contacts."""
+
     mass: float
-    com: np.ndarray
-    friction: float = 0.8
+    com: tuple[float, float, float]
 
 
-def toy_hand(
-    n_q,
-    J_a,
-    springs,
-    rest,
-    *,
-    tendon=True,
-    stiffness=np.inf,
-    coupling=None,
-    planar=None,
-    lower=-3.0,
-    upper=3.0,
-):
+def toy_hand(J_a, springs, rest, *, tendon=True, stiffness=np.inf, planar=None):
     J_a = np.atleast_2d(np.asarray(J_a, dtype=float))
+    n_a, n_q = J_a.shape
     return HandDescription(
         name="toy",
         urdf=UrdfModel(Path("toy.urdf"), "toy", (), (), "palm"),
@@ -89,18 +78,19 @@ def toy_hand(
         base_link="palm",
         link_names=tuple(f"l{j}" for j in range(n_q)),
         joint_names=tuple(f"j{j}" for j in range(n_q)),
-        joint_lower=np.broadcast_to(np.asarray(lower, dtype=float), (n_q,)).copy(),
-        joint_upper=np.broadcast_to(np.asarray(upper, dtype=float), (n_q,)).copy(),
+        joint_lower=np.full(n_q, -3.0),
+        joint_upper=np.full(n_q, 3.0),
         actuators=tuple(
-            Actuator(f"a{k}", -10.0, 10.0, tendon=tendon, stiffness=stiffness) for k in range(len(J_a))
+            Actuator(f"a{k}", -10.0, 10.0, tendon=tendon, stiffness=stiffness) for k in range(n_a)
         ),
         actuation_jacobian=J_a,
-        coupling=np.zeros((0, n_q)) if coupling is None else np.asarray(coupling, dtype=float),
+        coupling=np.zeros((0, n_q)),
         spring_stiffness=np.asarray(springs, dtype=float),
         spring_rest=np.asarray(rest, dtype=float),
         joint_friction=np.zeros(n_q),
         pads=(),
         planar_normal=planar,
+        gravity=(0.0, -9.81, 0.0) if planar else (0.0, 0.0, -9.81),
     )
 
 
@@ -114,7 +104,7 @@ def isotropic(normal: torch.Tensor, curvature: float) -> torch.Tensor:
     return curvature * (torch.eye(3, dtype=F64) - normal[..., :, None] * normal[..., None, :])
 
 
-def contact_set(links, points, normals, k_f, k_o, *, friction=3.0, gamma=0.0, pinned=False) -> ContactSet:
+def contact_set(links, points, normals, k_f, k_o=0.0, *, friction=3.0, gamma=0.0, pinned=False) -> ContactSet:
     n_c = len(links)
     points, normals = (torch.as_tensor(np.asarray(v), dtype=F64) for v in (points, normals))
     return ContactSet(
@@ -133,19 +123,32 @@ def contact_set(links, points, normals, k_f, k_o, *, friction=3.0, gamma=0.0, pi
 
 def select(contacts: ContactSet, index: list[int]) -> ContactSet:
     """The contacts with the given indices, in that order."""
-    names = (
-        "point",
-        "normal",
-        "gap",
-        "finger_curvature",
-        "object_curvature",
-        "friction",
-        "torsional_friction",
-    )
-    tuples = ("finger", "link", "pinned")
     return contacts.replace(
-        **{name: getattr(contacts, name)[index] for name in names},
-        **{name: tuple(getattr(contacts, name)[i] for i in index) for name in tuples},
+        **{name: getattr(contacts, name)[index] for name in (*VARYING, *SHARED)},
+        **{name: tuple(getattr(contacts, name)[i] for i in index) for name in ("finger", "link", "pinned")},
+    )
+
+
+def stacked(*contacts: ContactSet) -> ContactSet:
+    """One batch of contacts that differ in place only."""
+    return contacts[0].replace(
+        **{name: torch.stack([getattr(one, name) for one in contacts]) for name in VARYING}
+    )
+
+
+def batch_of(*states: GraspState) -> GraspState:
+    parts = zip(*((s.q, s.position, s.rotation) for s in states), strict=True)
+    return GraspState(*(torch.stack(part) for part in parts))
+
+
+def changed(model: KinematicModel, *, contacts=None, options=None, obj=None, **hand) -> KinematicModel:
+    """The model with other fields of its hand and options, another object, or other contacts."""
+    return KinematicModel(
+        dataclasses.replace(model.hand, **hand),
+        obj or model.obj,
+        dataclasses.replace(model.options, **(options or {})),
+        kinematics=model.kinematics,
+        detector=model.detector if contacts is None else lambda *_: contacts,
     )
 
 
@@ -153,8 +156,8 @@ def select(contacts: ContactSet, index: list[int]) -> ContactSet:
 class Toy:
     """A toy grasp in exact equilibrium: the spring rest angles are chosen so that it is at rest."""
 
-    model: object
-    state: object
+    model: KinematicModel
+    state: GraspState
     contacts: ContactSet
     mu: torch.Tensor
     lam: torch.Tensor
@@ -166,21 +169,13 @@ class Toy:
         return torch.tensor([actuator.unit for actuator in self.model.hand.actuators], dtype=F64)
 
     def solver(self, **options):
-        from equilibrium import EquilibriumSolver
-
         return EquilibriumSolver(self.model, self.state, self.contacts, **options)
 
     def forces(self):
-        from equilibrium import known_forces
-
         return known_forces(self.model.contact_kinematics(self.state, self.contacts), self.mu, self.lam)
 
     def equilibrium(self):
-        from equilibrium import Equilibrium
-
-        return Equilibrium(
-            self.state, self.a, self.mu, self.lam, torch.zeros(0, dtype=F64), self.contacts, 0.0
-        )
+        return Equilibrium(self.state, self.a, self.mu, self.lam, torch.zeros(0, dtype=F64), self.contacts)
 
 
 def build(
@@ -190,65 +185,38 @@ def build(
     springs,
     *,
     tip,
-    rho,
     normals,
     contact_links,
+    rho=0.008,
     grip=1.5,
-    mass=0.05,
     com=(0.003, -0.002, 0.004),
-    lam=-0.15,
+    lam=-20.0,
     k_o=0.0,
-    friction=3.0,
     gamma=0.0,
     pinned=False,
     stiffness=np.inf,
-    coupling=None,
     planar=None,
-    options=None,
-    tendon=True,
 ) -> Toy:
-    """Fingers at q whose ball tips touch an object with the given normals; at rest with the given grip.
+    """Fingers at q whose ball tips touch 50 g with the given normals, at rest with the given grip.
 
     ``lam`` is in the unit of ``J_a``, as ``stiffness`` is.
     """
-    from torch_ekm.contact.contact_kinematics import constraint_matrix
-    from torch_ekm.kinematics import GraspState
-    from torch_ekm.model import KinematicModel
-    from torch_ekm.model.stiffness.potential import gravity_gradient
-
     kin = ChainKinematics(fingers)
     q = torch.as_tensor(q, dtype=F64)
     n_q = len(q)
     poses = kin(q).transforms
-    tips = torch.stack(
-        [
-            (poses[kin.link_names.index(name)] @ torch.tensor([*tip, 1.0], dtype=F64))[:3]
-            for name in contact_links
-        ]
-    )
+    end = torch.tensor([*tip, 1.0], dtype=F64)
+    tips = torch.stack([(poses[kin.link_names.index(name)] @ end)[:3] for name in contact_links])
     normals = torch.as_tensor(np.asarray(normals), dtype=F64)
     normals = normals / normals.norm(dim=-1, keepdim=True)
-    points = tips - rho * normals
     contacts = contact_set(
-        contact_links,
-        points,
-        normals,
-        1 / rho if rho else 0.0,
-        k_o,
-        friction=friction,
-        gamma=gamma,
-        pinned=pinned,
+        contact_links, tips - rho * normals, normals, 1 / rho, k_o, gamma=gamma, pinned=pinned
     )
-    state = GraspState(q, points.mean(0), torch.eye(3, dtype=F64))
-    gravity = (0.0, -9.81, 0.0) if planar else (0.0, 0.0, -9.81)
-    obj = ToyObject(mass, np.asarray(com, dtype=float), friction)
+    state = GraspState(q, contacts.point.mean(0), torch.eye(3, dtype=F64))
 
     def make(rest):
-        hand = toy_hand(
-            n_q, J_a, springs, rest, stiffness=stiffness, coupling=coupling, planar=planar, tendon=tendon
-        )
-        hand = dataclasses.replace(hand, gravity=gravity)
-        return KinematicModel(hand, obj, options, kinematics=kin, detector=lambda *_: contacts)
+        hand = toy_hand(J_a, springs, rest, stiffness=stiffness, planar=planar)
+        return KinematicModel(hand, ToyObject(0.05, com), kinematics=kin, detector=lambda *_: contacts)
 
     model = make(np.zeros(n_q))
     ck = model.contact_kinematics(state, contacts)
@@ -277,85 +245,58 @@ def radial_finger(angle, radius=0.05):
 
 
 def three_finger(pinned=False, grip=1.0, **kw):
-    """Three fingers of three joints, three tendons (moment arms 9 and 8 mm), 50 g."""
+    """Three fingers of three joints, three tendons (moment arms 9 and 8 mm)."""
     angles = np.array([0.0, 2.1, 4.2])
-    fingers = [radial_finger(t) for t in angles]
-    q = np.array([0.05, 0.35, 0.3, -0.08, 0.3, 0.4, 0.03, 0.4, 0.25])
-    J_a = np.zeros((3, 9))
-    for i in range(3):
-        J_a[i, 3 * i + 1], J_a[i, 3 * i + 2] = 0.009, 0.008
     tilt = np.array([0.1, -0.05, 0.08])
-    normals = np.stack([np.cos(angles + 0.1), np.sin(angles + 0.1), tilt], axis=-1)
     return build(
-        fingers,
-        q,
-        J_a,
+        [radial_finger(t) for t in angles],
+        [0.05, 0.35, 0.3, -0.08, 0.3, 0.4, 0.03, 0.4, 0.25],
+        np.kron(np.eye(3), [0.0, 0.009, 0.008]),
         np.tile([0.25, 0.2, 0.15], 3),
         tip=(0.0, 0.0, 0.03),
-        rho=kw.pop("rho", 0.008),
-        normals=normals,
+        normals=np.stack([np.cos(angles + 0.1), np.sin(angles + 0.1), tilt], axis=-1),
         contact_links=["f0_l2", "f1_l2", "f2_l2"],
         grip=grip,
-        lam=kw.pop("lam", -20.0),
         pinned=pinned,
         **kw,
     )
 
 
-def soft_two_finger(grip=1.5, **kw):
+def soft_two_finger(**kw):
     """Two fingers of four joints with soft ball tips, two tendons, object balls or planes."""
     fingers = []
     for angle in (0.0, np.pi):
-        base = transform((0.05 * np.cos(angle), 0.05 * np.sin(angle), 0.0), (0.0, 0.0, angle))
-        fingers.append(
-            [
-                (base, np.array([0.0, 0, 1])),
-                (transform((0, 0, 0.005)), np.array([1.0, 0, 0])),
-                (np.eye(4), np.array([0.0, -1, 0])),
-                (transform((0, 0, 0.04)), np.array([0.0, -1, 0])),
-            ]
-        )
-    q = np.array([0.1, 0.05, 0.35, 0.3, -0.06, -0.04, 0.3, 0.35])
-    J_a = np.zeros((2, 8))
-    J_a[0, 2], J_a[0, 3], J_a[1, 6], J_a[1, 7] = 0.009, 0.008, 0.009, 0.008
+        (base, abduction), flexion, far = radial_finger(angle)
+        foot = (transform((0, 0, 0.005)), abduction)
+        fingers.append([(base, np.array([0.0, 0, 1])), foot, flexion, far])
     return build(
         fingers,
-        q,
-        J_a,
+        [0.1, 0.05, 0.35, 0.3, -0.06, -0.04, 0.3, 0.35],
+        np.kron(np.eye(2), [0.0, 0.0, 0.009, 0.008]),
         np.tile([0.2, 0.25, 0.2, 0.15], 2),
         tip=(0.0, 0.0, 0.03),
-        rho=0.008,
         normals=[[1.0, 0.08, 0.05], [-1.0, 0.06, -0.03]],
         contact_links=["f0_l3", "f1_l3"],
-        grip=grip,
-        lam=-20.0,
         gamma=0.03,
-        com=kw.pop("com", (0.0, 0.0, 0.0)),
-        **kw,
+        **{"com": (0.0, 0.0, 0.0), **kw},
     )
 
 
-def planar_two_finger(pinned=False, grip=1.5, **kw):
+def planar_two_finger(pinned=False, J_a=None, **kw):
     """Two fingers of two joints in the x-y plane, two tendons; gravity along -y."""
-    fingers, z = [], np.array([0.0, 0.0, 1.0])
-    for side in (1.0, -1.0):
-        fingers.append(
-            [(transform((0.04 * side, 0.0, 0.0)), side * z), (transform((0.0, 0.04, 0.0)), side * z)]
-        )
-    q = np.array([0.3, 0.35, 0.25, 0.4])
-    J_a = np.zeros((2, 4))
-    J_a[0, :2], J_a[1, 2:] = (0.009, 0.008), (0.009, 0.008)
+    z = np.array([0.0, 0.0, 1.0])
+    fingers = [
+        [(transform((0.04 * side, 0.0, 0.0)), side * z), (transform((0.0, 0.04, 0.0)), side * z)]
+        for side in (1.0, -1.0)
+    ]
     return build(
         fingers,
-        q,
-        J_a,
+        [0.3, 0.35, 0.25, 0.4],
+        np.kron(np.eye(2), [0.009, 0.008]) if J_a is None else J_a,
         np.tile([0.2, 0.15], 2),
         tip=(0.0, 0.03, 0.0),
-        rho=0.008,
         normals=[[1.0, 0.15, 0.0], [-1.0, 0.1, 0.0]],
         contact_links=["f0_l1", "f1_l1"],
-        grip=grip,
-        lam=-20.0,
         pinned=pinned,
         planar=(0.0, 0.0, 1.0),
         com=(0.002, -0.003, 0.0),
@@ -387,16 +328,3 @@ def scaled(J, n_q, length=0.03):
 
 def relative_error(J, truth, n_q):
     return float((scaled(J, n_q) - scaled(truth, n_q)).norm() / scaled(truth, n_q).norm())
-
-
-def step_error_slope(solver, start, J, directions, sizes):
-    """Order of ``|ds - J da|`` in ``|da|``, averaged over directions."""
-    n_q = len(start.state.q)
-    slopes = []
-    for direction in directions:
-        errors = []
-        for size in sizes:
-            exact = solver.moved(start, start.a + size * direction).state.minus(start.state)
-            errors.append(float(scaled((exact - J @ (size * direction))[:, None], n_q).norm()))
-        slopes.append(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
-    return np.array(slopes)

@@ -9,20 +9,29 @@ import torch
 
 from torch_ekm.contact.contact_kinematics import FLAT, contact_frames
 from torch_ekm.contact.contact_set import ContactSet
-from torch_ekm.exceptions import ParameterError
 from torch_ekm.typing import Float, Tensor
 
 
 @dataclass(frozen=True)
 class Core:
-    """A rounded body: all points within ``radius`` of a point, a line or a half space, in its own frame."""
+    """A rounded body: all points within ``radius`` of a point, a line or a plane."""
 
-    kind: str
-    """"point", "line" or "plane"."""
-    point: Float[Tensor, 3]
-    direction: Float[Tensor, 3]
-    """Of the line; outward normal of the plane; unused for a point."""
+    point: Float[Tensor, " 3"]
+    outward: Float[Tensor, " 3"]
+    """Where it is touched at first: always so of a plane, and of a pinned contact."""
+    directions: Float[Tensor, "3 k"]
+    """That the line or the plane extends in; none of a point."""
     radius: float
+
+    def moved(self, rotation: Tensor, position: Tensor) -> Core:
+        point = position + rotation @ self.point
+        return Core(point, rotation @ self.outward, rotation @ self.directions, self.radius)
+
+    def curvature(self, normal: Tensor) -> Tensor:
+        if self.radius == 0:
+            return normal.new_zeros(3, 3)
+        across = torch.eye(3, dtype=normal.dtype) - torch.outer(normal, normal)
+        return (across - self.directions @ self.directions.mT) / self.radius
 
 
 class TrackedContacts:
@@ -33,14 +42,7 @@ class TrackedContacts:
     contact stays on the same feature. Contact points, normals and gaps are then smooth functions of the
     state, without the tolerance of a collision detector.
 
-    Args:
-        contacts: contacts of one state.
-        link_pose: ``q -> (n_c, 4, 4)`` poses of the links that carry them.
-        q, position, rotation: that state.
-
-    Raises:
-        ParameterError: a hollow surface, a finger that is flat at the contact, two unequal curvatures, or a
-            cylindrical finger lying on a flat face (a line contact has no contact point).
+    ``contacts`` are those of one state, and ``link_pose(q)`` the poses of the links that carry them.
     """
 
     def __init__(
@@ -52,120 +54,76 @@ class TrackedContacts:
         rotation: Tensor,
     ) -> None:
         self.contacts, self.link_pose = contacts, link_pose
-        poses = link_pose(q)
         self.finger: list[Core] = []
         self.object: list[Core] = []
-        for i in range(contacts.n_c):
+        for i, pose in enumerate(link_pose(q)):
             x, n = contacts.point[i], contacts.normal[i]
-            R_f, o_f = poses[i, :3, :3], poses[i, :3, 3]
             touch = x + contacts.gap[i] * n  # on the finger
             if contacts.pinned[i]:
-                finger, obj = Core("point", touch, n, 0.0), Core("point", x, n, 0.0)
+                finger, obj = (Core(point, n, n.new_zeros(3, 0), 0.0) for point in (touch, x))
             else:
-                finger = _core(contacts.finger_curvature[i], touch, -n, contacts.finger[i])
-                obj = _core(contacts.object_curvature[i], x, n, "object")
-                if finger.kind == "plane" or (finger.kind == "line" and obj.kind == "plane"):
-                    raise ParameterError(
-                        "contacts", contacts.finger[i], "a ball, or a cylinder against a curved surface"
-                    )
-            self.finger.append(
-                Core(finger.kind, R_f.mT @ (finger.point - o_f), R_f.mT @ finger.direction, finger.radius)
-            )
-            self.object.append(
-                Core(obj.kind, rotation.mT @ (obj.point - position), rotation.mT @ obj.direction, obj.radius)
-            )
+                finger = _core(contacts.finger_curvature[i], touch, -n)
+                obj = _core(contacts.object_curvature[i], x, n)
+                # a line contact has no contact point
+                assert finger.directions.shape[1] + obj.directions.shape[1] <= 2
+            R, o = pose[:3, :3].mT, pose[:3, 3]
+            self.finger.append(finger.moved(R, -R @ o))
+            self.object.append(obj.moved(rotation.mT, -rotation.mT @ position))
 
     def __call__(
-        self, q: Float[Tensor, " n_q"], position: Float[Tensor, 3], rotation: Float[Tensor, "3 3"]
+        self, q: Float[Tensor, " n_q"], position: Float[Tensor, " 3"], rotation: Float[Tensor, "3 3"]
     ) -> ContactSet:
         """The same contacts at another state."""
-        poses = self.link_pose(q)
-        points, normals, gaps, K_f, K_o = [], [], [], [], []
-        for i, (finger, obj) in enumerate(zip(self.finger, self.object, strict=True)):
-            R_f, o_f = poses[i, :3, :3], poses[i, :3, 3]
-            p_f, d_f = o_f + R_f @ finger.point, R_f @ finger.direction
-            p_o, d_o = position + rotation @ obj.point, rotation @ obj.direction
+        rows = []
+        for i, pose in enumerate(self.link_pose(q)):
+            finger, obj = (
+                self.finger[i].moved(pose[:3, :3], pose[:3, 3]),
+                self.object[i].moved(rotation, position),
+            )
             if self.contacts.pinned[i]:
                 # the finger's point carries the contact; the normal is fixed to the object
-                points.append(p_f)
-                normals.append(d_o)
-                gaps.append(d_o @ (p_f - p_o))
-                K_f.append(self.contacts.finger_curvature[i])
-                K_o.append(self.contacts.object_curvature[i])
+                curvatures = self.contacts.finger_curvature[i], self.contacts.object_curvature[i]
+                rows.append(
+                    (finger.point, obj.outward, obj.outward @ (finger.point - obj.point), *curvatures)
+                )
                 continue
-            at_f, at_o = _closest(finger.kind, p_f, d_f, obj.kind, p_o, d_o)
-            if obj.kind == "plane":
-                n = d_o
+            at_f, at_o = _closest(finger, obj)
+            if obj.directions.shape[1] == 2:
+                n = obj.outward
                 distance = n @ (at_f - at_o)
             else:
                 distance = torch.linalg.vector_norm(at_f - at_o)
                 n = (at_f - at_o) / distance
-            points.append(at_o + obj.radius * n)
-            normals.append(n)
-            gaps.append(distance - finger.radius - obj.radius)
-            K_f.append(_curvature(finger, n, d_f))
-            K_o.append(_curvature(obj, n, d_o))
-        return self.contacts.replace(
-            point=torch.stack(points),
-            normal=torch.stack(normals),
-            gap=torch.stack(gaps),
-            finger_curvature=torch.stack(K_f),
-            object_curvature=torch.stack(K_o),
-        )
+            gap = distance - finger.radius - obj.radius
+            rows.append((at_o + obj.radius * n, n, gap, finger.curvature(n), obj.curvature(n)))
+        names = ("point", "normal", "gap", "finger_curvature", "object_curvature")
+        parts = zip(names, zip(*rows, strict=True), strict=True)
+        return self.contacts.replace(**{name: torch.stack(part) for name, part in parts})
 
     def pinned_offset(self, q: Tensor, position: Tensor, rotation: Tensor) -> Float[Tensor, "n_c 3"]:
         """``x_f(q) - x_o(p)`` of pinned contacts' material points, object axes [m]; 0 for the others."""
-        poses = self.link_pose(q)
         offset = torch.zeros_like(self.contacts.point)
-        for i, (finger, obj) in enumerate(zip(self.finger, self.object, strict=True)):
+        for i, pose in enumerate(self.link_pose(q)):
             if self.contacts.pinned[i]:
-                p_f = poses[i, :3, 3] + poses[i, :3, :3] @ finger.point
-                offset[i] = rotation.mT @ (p_f - position) - obj.point
+                finger = self.finger[i].moved(pose[:3, :3], pose[:3, 3])
+                offset[i] = rotation.mT @ (finger.point - position) - self.object[i].point
         return offset
 
 
-def _core(K: Tensor, surface_point: Tensor, outward: Tensor, name: str) -> Core:
+def _core(K: Tensor, surface_point: Tensor, outward: Tensor) -> Core:
     """Ball, cylinder or plane with the given curvature tensor at a surface point."""
     tangent = contact_frames(outward[None])[0, :, 1:]
-    k = tangent.mT @ K @ tangent
-    values, vectors = torch.linalg.eigh(0.5 * (k + k.mT))
-    low, high = values.tolist()
-    if low < -FLAT:
-        raise ParameterError("curvature", (low, high), f"convex or flat at '{name}'")
-    flat_direction = tangent @ vectors[:, 0]
-    if high <= FLAT:
-        return Core("plane", surface_point, outward, 0.0)
-    if low <= FLAT:
-        return Core("line", surface_point - outward / high, flat_direction, 1 / high)
-    if high - low > 1e-6 * high:
-        raise ParameterError("curvature", (low, high), f"isotropic or flat in one direction at '{name}'")
-    return Core("point", surface_point - outward / high, outward, 1 / high)
+    values, vectors = torch.linalg.eigh(tangent.mT @ K @ tangent)
+    curved = values[values > FLAT]
+    assert float(values.min()) >= -FLAT
+    assert len(curved) < 2 or float(curved[1] - curved[0]) <= 1e-6 * float(curved[1])
+    radius = 1 / float(curved[0]) if len(curved) else 0.0
+    return Core(surface_point - radius * outward, outward, tangent @ vectors[:, values <= FLAT], radius)
 
 
-def _curvature(core: Core, normal: Tensor, direction: Tensor) -> Tensor:
-    if core.kind == "plane":
-        return normal.new_zeros(3, 3)
-    eye = torch.eye(3, dtype=normal.dtype, device=normal.device)
-    K = eye - torch.outer(normal, normal)
-    if core.kind == "line":
-        K = K - torch.outer(direction, direction)
-    return K / core.radius
-
-
-def _closest(
-    kind_f: str, p_f: Tensor, d_f: Tensor, kind_o: str, p_o: Tensor, d_o: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Closest points of the finger's core (point or line) and the object's (point, line or plane)."""
-    if kind_f == "point":
-        if kind_o == "plane":
-            return p_f, p_f - d_o * (d_o @ (p_f - p_o))
-        return p_f, p_o if kind_o == "point" else p_o + d_o * (d_o @ (p_f - p_o))
-    if kind_o == "point":
-        return p_f + d_f * (d_f @ (p_o - p_f)), p_o
-    w, b = p_f - p_o, d_f @ d_o
-    denominator = 1 - b * b
-    if float(denominator) < 1e-8:  # parallel cylinders touch along a line: keep the finger's own point
-        return p_f, p_o + d_o * (d_o @ w)
-    s = (b * (d_o @ w) - d_f @ w) / denominator
-    t = ((d_o @ w) - b * (d_f @ w)) / denominator
-    return p_f + s * d_f, p_o + t * d_o
+def _closest(finger: Core, obj: Core) -> tuple[Tensor, Tensor]:
+    """Closest points of two cores."""
+    k = finger.directions.shape[1]
+    both = torch.cat([finger.directions, -obj.directions], dim=1)
+    along = torch.linalg.pinv(both) @ (obj.point - finger.point)
+    return finger.point + finger.directions @ along[:k], obj.point + obj.directions @ along[k:]

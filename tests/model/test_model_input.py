@@ -9,16 +9,9 @@ import numpy as np
 import pytest
 import torch
 from model_icub import gripped
-from model_toys import (
-    F64,
-    build,
-    relative_error,
-    three_finger,
-    toy_hand,
-    transform,
-)
+from model_toys import F64, batch_of, changed, planar_two_finger, relative_error, stacked, three_finger
 
-from torch_ekm.contact import ContactDetector, ContactSet
+from torch_ekm.contact import ContactSet
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import DescriptionError, EKMError, NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import GraspState
@@ -47,15 +40,8 @@ def at(field, value, where=1):
 
 
 def felt(force):
-    hand = dataclasses.replace(MODEL.hand, pads=tuple(_pad(name) for name in CONTACTS.finger))
-    model = KinematicModel(
-        hand, MODEL.obj, MODEL.options, kinematics=MODEL.kinematics, detector=lambda *_: CONTACTS
-    )
-    return model.linearize(STATE, fingertip_force=force)
-
-
-def _pad(name):
-    return dataclasses.replace(HAND.pads[0], name=name)
+    pads = tuple(dataclasses.replace(HAND.pads[0], name=name) for name in CONTACTS.finger)
+    return changed(MODEL, pads=pads).linearize(STATE, fingertip_force=force)
 
 
 WRONG = {
@@ -123,6 +109,8 @@ WRONG = {
         DescriptionError,
         "pads",
     ),
+    "word for unstable": (lambda: ModelOptions(on_unstable="ignore"), ParameterError, "on_unstable"),
+    "margin": (lambda: ModelOptions(contact_margin=-1.0), ParameterError, "contact_margin"),
     "overlap": (lambda: ModelOptions(max_overlap=0.0), ParameterError, "max_overlap"),
     "slack tension": (lambda: ModelOptions(slack_tension=-1.0), ParameterError, "slack_tension"),
 }
@@ -133,8 +121,7 @@ def _single(s):
 
 
 def _held(**changes):
-    obj = dataclasses.replace(MODEL.obj, **changes)
-    return KinematicModel(MODEL.hand, obj, kinematics=MODEL.kinematics, detector=lambda *_: CONTACTS)
+    return changed(MODEL, obj=dataclasses.replace(MODEL.obj, **changes))
 
 
 @pytest.mark.parametrize("case", WRONG)
@@ -151,11 +138,7 @@ def test_a_planar_hand_may_have_its_normal_either_way_round_and_of_any_length():
 
 def test_arrays_lists_and_both_precisions_are_read():
     expected = MODEL.linearize(STATE).manipulation_jacobian
-    kinds = {
-        "numpy": lambda x: x.numpy(),
-        "list": lambda x: x.tolist(),
-    }
-    for kind in kinds.values():
+    for kind in (torch.Tensor.numpy, torch.Tensor.tolist):
         s = GraspState(*(kind(x) for x in (STATE.q, STATE.position, STATE.rotation)))
         assert torch.equal(MODEL.linearize(s).manipulation_jacobian, expected)
         fields = {f.name: getattr(CONTACTS, f.name) for f in dataclasses.fields(CONTACTS)}
@@ -172,17 +155,7 @@ def test_arrays_lists_and_both_precisions_are_read():
     assert torch.equal(step, MODEL.linearize(STATE).step(np.array([0.01, 0, 0])))
     assert torch.allclose(step, MODEL.linearize(STATE).step(torch.tensor([0.01, 0, 0])), rtol=1e-6)
     assert torch.equal(felt([1.0, NAN, 1.0]).forces.mu, felt(np.array([1.0, NAN, 1.0])).forces.mu)
-
-
-def test_a_sensor_that_reads_a_little_below_zero_is_noise():
-    assert felt([-0.1, 0.0, 0.0]).forces.solved
-
-
-def variant(toy, **changes):
-    model, options = toy.model, dataclasses.replace(toy.model.options, **changes)
-    return KinematicModel(
-        model.hand, model.obj, options, kinematics=model.kinematics, detector=lambda *_: toy.contacts
-    )
+    assert felt([-0.1, 0.0, 0.0]).forces.solved  # a sensor that reads a little below zero is noise
 
 
 def test_a_very_stiff_actuator_is_rigid_without_false_alarm():
@@ -191,9 +164,7 @@ def test_a_very_stiff_actuator_is_rigid_without_false_alarm():
 
     def jacobian(stiffness):
         actuators = tuple(dataclasses.replace(a, stiffness=stiffness) for a in model.hand.actuators)
-        hand = dataclasses.replace(model.hand, actuators=actuators)
-        args = {"kinematics": model.kinematics, "detector": model.detector}
-        stiff = KinematicModel(hand, model.obj, model.options, **args)
+        stiff = changed(model, actuators=actuators)
         return stiff.linearize(equilibrium.state, equilibrium.contacts, forces=forces).manipulation_jacobian
 
     assert relative_error(jacobian(1e12), jacobian(math.inf), 20) < 1e-12
@@ -201,40 +172,20 @@ def test_a_very_stiff_actuator_is_rigid_without_false_alarm():
 
 
 def loose_tendon():
-    """Two planar fingers of two joints with a tendon on each joint; that of the first joint pulls nothing."""
+    """A tendon on each joint of the left finger: that of the first one pulls nothing; and without it."""
     J_a = np.array([[0.009, 0.0, 0, 0], [0.004, 0.008, 0, 0], [0, 0, 0.009, 0.008]])
-    z = np.array([0.0, 0.0, 1.0])
-    fingers = [
-        [(transform((0.04 * side, 0.0, 0.0)), side * z), (transform((0.0, 0.04, 0.0)), side * z)]
-        for side in (1.0, -1.0)
-    ]
-
-    def make(rows, lam):
-        return build(
-            fingers,
-            np.array([0.3, 0.35, 0.25, 0.4]),
-            J_a[rows],
-            np.tile([0.2, 0.15], 2),
-            tip=(0.0, 0.03, 0.0),
-            rho=0.008,
-            normals=[[1.0, 0.15, 0.0], [-1.0, 0.1, 0.0]],
-            contact_links=["f0_l1", "f1_l1"],
-            lam=torch.tensor(lam, dtype=F64),
-            planar=(0.0, 0.0, 1.0),
-            com=(0.002, -0.003, 0.0),
-        )
-
-    return make([0, 1, 2], [0.0, -20.0, -20.0]), make([1, 2], [-20.0, -20.0])
+    lam = torch.tensor([0.0, -20.0, -20.0], dtype=F64)
+    return planar_two_finger(J_a=J_a, lam=lam), planar_two_finger(J_a=J_a[1:])
 
 
 def test_a_slack_tendon_moves_nothing_and_holds_nothing():
     toy, without = loose_tendon()
     truth = without.model.linearize(without.state).manipulation_jacobian
     for options in ({}, {"slack_tension": 0.0}, {"slack_tension": 1e-3}):
-        J = variant(toy, **options).linearize(toy.state).manipulation_jacobian
+        J = changed(toy.model, options=options).linearize(toy.state).manipulation_jacobian
         assert J[:, 0].abs().max() == 0
         assert relative_error(J[:, 1:], truth, 4) < 1e-4
-    rods = variant(toy, slack_tension=None).linearize(toy.state).manipulation_jacobian
+    rods = changed(toy.model, options={"slack_tension": None}).linearize(toy.state).manipulation_jacobian
     assert rods[:, 0].abs().max() > 0
     assert relative_error(rods[:, 1:], truth, 4) > 0.1  # rods hold what tendons let go
     # forces that were not found say nothing about tensions
@@ -254,20 +205,9 @@ def test_states_of_a_batch_have_their_own_slack_tendons():
         if f.name not in ("status", "lam", "covariance", "margin_std")
     }
     both = dataclasses.replace(forces, lam=lam, status=forces.status * 2, **wide)
-    fields = ("point", "normal", "gap", "finger_curvature", "object_curvature")
-    contacts = toy.contacts.replace(**{n: torch.stack([getattr(toy.contacts, n)] * 2) for n in fields})
-    states = GraspState(*(torch.stack([x, x]) for x in (toy.state.q, toy.state.position, toy.state.rotation)))
+    states, contacts = batch_of(toy.state, toy.state), stacked(toy.contacts, toy.contacts)
     J = toy.model.linearize(states, contacts, forces=both).manipulation_jacobian
     one = toy.model.linearize(toy.state, forces=forces).manipulation_jacobian
     assert torch.allclose(J[0], one, atol=1e-12)
     assert J[0, :, 0].abs().max() == 0
     assert J[1, :, 0].abs().max() > 0
-
-
-def test_detector_without_pads():
-    with pytest.raises(DescriptionError, match="pads"):
-        ContactDetector(dataclasses.replace(HAND, pads=()), BOX)
-
-
-def test_the_toy_hand_has_no_urdf_and_may_be_planar():
-    assert toy_hand(2, np.eye(2), [0.1, 0.1], [0.0, 0.0], planar=(0, 0, 1.0)).planar_normal == (0, 0, 1.0)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from model_icub import gripped
-from model_toys import F64, soft_two_finger, three_finger
-from test_model_failures import rebuilt
+from model_toys import F64, batch_of, changed, soft_two_finger, stacked, three_finger
 
 pytest.importorskip("coal")
 
@@ -25,8 +24,7 @@ def kinds(lin):
     return [doubt.kind for doubt in lin.doubts]
 
 
-def test_a_sound_state_has_no_doubts():
-    toy = three_finger()
+def test_a_sound_state_has_no_doubts(toy):
     lin = toy.model.linearize(toy.state, forces=toy.forces())
     assert lin.doubts == ()
     assert lin.status is ModelStatus.OK
@@ -35,8 +33,7 @@ def test_a_sound_state_has_no_doubts():
 def test_an_object_of_2_kg_described_as_80_g_shows_in_the_joint_torques():
     model, _, at = gripped("box")
     heavy = dataclasses.replace(model.obj, mass=2.0)  # described as 80 g
-    args = {"kinematics": model.kinematics, "detector": model.detector}
-    lin = KinematicModel(model.hand, heavy, model.options, **args).linearize(at.state, at.contacts)
+    lin = changed(model, obj=heavy).linearize(at.state, at.contacts)
     found = {doubt.kind: doubt for doubt in lin.doubts}
     doubt = found[ModelStatus.UNEXPLAINED_TORQUE]
     worst = int(lin.forces.residual.abs().argmax())
@@ -47,8 +44,7 @@ def test_an_object_of_2_kg_described_as_80_g_shows_in_the_joint_torques():
     assert doubt.what in str(doubt)
 
 
-def test_the_friction_limit_names_the_pad_and_worse_doubts_come_first():
-    toy = three_finger()
+def test_the_friction_limit_names_the_pad_and_worse_doubts_come_first(toy):
     slippery = toy.contacts.replace(
         friction=torch.full((3,), 0.36, dtype=F64),
         near_misses=(NearMiss("f1_l0", None, -0.0002),),
@@ -70,7 +66,7 @@ def toy_with_pads():
         dataclasses.replace(load_hand("icub_right").pads[0], name=name, link=link)
         for name, link in zip(toy.contacts.finger, toy.contacts.link, strict=True)
     )
-    return toy, rebuilt(toy, pads=pads)
+    return toy, changed(toy.model, pads=pads)
 
 
 def test_sensors_that_disagree_with_the_balance():
@@ -122,19 +118,26 @@ def test_a_contact_beyond_the_margin(gap, measured, before, doubted):
         assert f"contact_margin={gap + 1e-4:.4f}" in str(found[0])
 
 
-def test_the_detector_tells_a_link_that_touches_from_one_that_does_not():
+def ball_beside(link: str, gap: float, radius: float, **options):
+    """A model, and a ball at a distance [m] from a finger's pad, or from the side of a link that has none."""
     hand, box = load_hand("icub_right"), load_object("box")
     kinematics = HandKinematics(hand)
     q = torch.zeros(hand.n_q, dtype=F64)
-    T = kinematics(q).of("index_2")
-    (link,) = [link for link in hand.urdf.links if link.name == "index_2"]
-    (capsule,) = link.collisions
-    centre = (T @ torch.as_tensor(capsule.transform))[:3, 3]
-    side = T[:3, 1]  # across the finger, out of the palm
+    T = kinematics(q).of(link)
+    pads = [pad for pad in hand.pads if pad.link == link]
+    if pads:
+        at, side, own = torch.tensor([*pads[0].end, 1.0], dtype=F64), T[:3, 0], pads[0].radius
+    else:
+        (capsule,) = hand.urdf.link(link).collisions
+        at, side, own = torch.from_numpy(capsule.transform[:, 3]), T[:3, 1], capsule.size[0]
+    ball = dataclasses.replace(box, shapes=(Shape("sphere", (radius,), np.eye(4)),))
+    state = GraspState(q, (T @ at)[:3] + side * (own + radius + gap), torch.eye(3, dtype=F64))
+    return KinematicModel(hand, ball, ModelOptions(**options), kinematics=kinematics), state
+
+
+def test_the_detector_tells_a_link_that_touches_from_one_that_does_not():
     for gap, touches in ((0.0005, True), (0.0015, False), (-0.001, True)):
-        small = dataclasses.replace(box, shapes=(Shape("sphere", (0.004,), np.eye(4)),))
-        state = GraspState(q, centre + side * (capsule.size[0] + 0.004 + gap), torch.eye(3, dtype=F64))
-        model = KinematicModel(hand, small, ModelOptions(contact_margin=0.02), kinematics=kinematics)
+        model, state = ball_beside("index_2", gap, 0.004, contact_margin=0.02)
         missed = [near for near in model.contacts(state).near_misses if near.pad is None]
         assert [near.link for near in missed] == (["index_2"] if touches else [])
         if touches:
@@ -142,26 +145,13 @@ def test_the_detector_tells_a_link_that_touches_from_one_that_does_not():
 
 
 def test_pads_left_out_come_with_their_gaps():
-    hand, box = load_hand("icub_right"), load_object("box")
-    kinematics = HandKinematics(hand)
-    q = torch.zeros(hand.n_q, dtype=F64)
-    pads = {pad.name: pad for pad in hand.pads}
-    poses = kinematics(q)
-
-    def end(name):
-        pad = pads[name]
-        return (poses.of(pad.link) @ torch.tensor([*pad.end, 1.0], dtype=F64))[:3]
-
-    ball = dataclasses.replace(box, shapes=(Shape("sphere", (0.01,), np.eye(4)),))
-    out = poses.of(pads["index"].link)[:3, 0]
-    centre = end("index") + out * (0.01 + pads["index"].radius + 0.001)
-    contacts = KinematicModel(hand, ball, kinematics=kinematics).contacts(
-        GraspState(q, centre, torch.eye(3, dtype=F64))
-    )
+    model, state = ball_beside("index_3", 0.001, 0.01)
+    contacts, pads = model.contacts(state), {pad.name: pad for pad in model.hand.pads}
     assert "index" in contacts.finger
     left_out = {near.pad: near.gap for near in contacts.near_misses if near.pad}
     assert set(left_out) == set(pads) - set(contacts.finger)
-    far = float((end("thumb") - centre).norm()) - 0.01 - pads["thumb"].radius
+    thumb = model.kinematics(state.q).of("thumb_3") @ torch.tensor([*pads["thumb"].end, 1.0], dtype=F64)
+    far = float((thumb[:3] - state.position).norm()) - 0.01 - pads["thumb"].radius
     assert left_out["thumb"] == pytest.approx(far, abs=2e-3)
     assert left_out["thumb"] > 0.002
 
@@ -169,15 +159,8 @@ def test_pads_left_out_come_with_their_gaps():
 @pytest.mark.parametrize(("gap", "force", "touches"), [(5, 0.6, True), (7, 0.6, False), (5, 0.4, False)])
 def test_a_pad_that_measures_a_force_touches_whatever_the_gap(gap, force, touches):
     """5 mm off, by an object or a pad that is described wrongly; a pad 7 mm off presses on something else."""
-    hand, box = load_hand("icub_right"), load_object("box")
-    q, kinematics = torch.zeros(hand.n_q, dtype=F64), HandKinematics(hand)
-    pad = next(pad for pad in hand.pads if pad.name == "index")
-    pose = kinematics(q).of(pad.link)
-    centre = (pose @ torch.tensor([*pad.end, 1.0], dtype=F64))[:3]
-    centre = centre + pose[:3, 0] * (0.01 + pad.radius + 1e-3 * gap)
-    ball = dataclasses.replace(box, shapes=(Shape("sphere", (0.01,), np.eye(4)),))
-    model, state = KinematicModel(hand, ball), GraspState(q, centre, torch.eye(3, dtype=F64))
-    measured = torch.tensor([force * (one is pad) for one in hand.pads], dtype=F64)
+    model, state = ball_beside("index_3", 1e-3 * gap, 0.01)
+    measured = torch.tensor([force * (pad.name == "index") for pad in model.hand.pads], dtype=F64)
     with pytest.raises(NoContactError):
         model.contacts(state)
     for found in (model.contacts, model.touching):
@@ -190,23 +173,21 @@ def test_a_pad_that_measures_a_force_touches_whatever_the_gap(gap, force, touche
                 found(state, measured)
 
 
-def test_the_name_of_the_actuator_that_cannot_move():
-    toy = three_finger()
+def test_the_name_of_the_actuator_that_cannot_move(toy):
     J_a = toy.model.hand.actuation_jacobian
     doubled = np.concatenate([J_a, J_a[:1]])
     actuators = tuple(
         dataclasses.replace(a, name=n)
         for a, n in zip((*toy.model.hand.actuators, toy.model.hand.actuators[0]), "pqrs", strict=True)
     )
+    moved = dataclasses.replace(toy.state, q=toy.state.q.clone().requires_grad_())
     for on_unstable in ("raise", "flag"):
-        options = dataclasses.replace(toy.model.options, on_unstable=on_unstable)
-        with pytest.raises(SingularGraspError, match=r"actuator '[ps]' cannot move alone"):
-            rebuilt(toy, options=options, actuation_jacobian=doubled, actuators=actuators).linearize(
-                toy.state
-            )
-        moved = dataclasses.replace(toy.state, q=toy.state.q.clone().requires_grad_())
-        with pytest.raises(SingularGraspError, match=r"actuator '[ps]' cannot move alone"):
-            rebuilt(toy, options=options, actuation_jacobian=doubled, actuators=actuators).linearize(moved)
+        model = changed(
+            toy.model, options={"on_unstable": on_unstable}, actuation_jacobian=doubled, actuators=actuators
+        )
+        for state in (toy.state, moved):
+            with pytest.raises(SingularGraspError, match=r"actuator '[ps]' cannot move alone"):
+                model.linearize(state)
 
 
 @pytest.mark.parametrize("toy", [three_finger, soft_two_finger])
@@ -228,8 +209,7 @@ def test_margins_after_an_increment_follow_the_sensitivities_and_the_cone(toy):
     assert many.margin_std.shape == (2, *after.margin.shape)
 
 
-def test_increments_that_are_no_increments():
-    toy = three_finger()
+def test_increments_that_are_no_increments(toy):
     lin = toy.model.linearize(toy.state)
     for call in (lin.step, lin.margins_after, lin.forces_after):
         with pytest.raises(ShapeError, match="delta_a"):
@@ -238,24 +218,15 @@ def test_increments_that_are_no_increments():
             call(torch.full((3,), float("nan"), dtype=F64))
 
 
-def test_a_batch_is_judged_by_its_worst_state():
-    toy = three_finger()
-    fields = ("point", "normal", "gap", "finger_curvature", "object_curvature")
-    contacts = toy.contacts.replace(
-        **{name: torch.stack([getattr(toy.contacts, name)] * 2) for name in fields}
-    )
-    turn = torch.tensor([[0.0], [2.0]], dtype=F64)  # a state far from equilibrium
-    states = GraspState(
-        toy.state.q + turn, toy.state.position.expand(2, 3), toy.state.rotation.expand(2, 3, 3)
-    )
-    options = dataclasses.replace(toy.model.options, on_unstable="flag")
-    lin = rebuilt(toy, options=options).linearize(states, contacts)
+def test_a_batch_is_judged_by_its_worst_state(toy):
+    far = dataclasses.replace(toy.state, q=toy.state.q + 2.0)  # from equilibrium
+    model = changed(toy.model, options={"on_unstable": "flag"})
+    lin = model.linearize(batch_of(toy.state, far), stacked(toy.contacts, toy.contacts))
     doubt = next(d for d in lin.doubts if d.kind is ModelStatus.UNEXPLAINED_TORQUE)
     assert doubt.value == pytest.approx(float(lin.forces.residual.norm(dim=-1).max()))
 
 
-def test_forces_of_a_solver_that_failed_are_unknown():
-    toy = three_finger()
+def test_forces_of_a_solver_that_failed_are_unknown(toy):
     failed = dataclasses.replace(toy.forces(), violation=torch.full((), torch.nan))
     message = _of_missing_forces(failed, reused=False).message
     assert "nan" not in message

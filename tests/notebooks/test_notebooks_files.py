@@ -10,9 +10,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import pytest
-from typer.testing import CliRunner
 
-from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError
 from torch_ekm.experiments.reporting.notebook import (
     copy_notebooks,
@@ -108,14 +106,6 @@ def test_copies(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(DescriptionError, match="name a folder"):
         copy_notebooks(tmp_path / "file")
-
-
-def test_command_lists_and_copies(tmp_path: Path) -> None:
-    listed = CliRunner().invoke(app, ["notebooks"])
-    assert [Path(line).name for line in listed.output.splitlines()] == NAMES
-    copied = CliRunner().invoke(app, ["notebooks", "--copy", str(tmp_path)])
-    assert copied.exit_code == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == NAMES
 
 
 def test_smoke_mode_is_switched_on_by_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,29 +3,16 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from fakes import FakePlant
+from test_plant_gate import DEG, EYE, HAND, ORIGIN, REACH
 
 from torch_ekm.exceptions import NonFiniteError, ShapeError
 from torch_ekm.kinematics import ServoModel
 from torch_ekm.plant import Observation, ServoInverse
-
-DEG = math.pi / 180
-EYE, ORIGIN = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-REACH = 60 * DEG * np.ones(3)
-HAND = SimpleNamespace(
-    name="three",
-    actuator_names=("thumb", "index", "middle"),
-    actuator_lower=-REACH,
-    actuator_upper=REACH,
-    n_q=3,
-    n_a=3,
-    pads=range(3),
-)
 
 
 class Servos(FakePlant):
