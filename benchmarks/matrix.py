@@ -127,7 +127,7 @@ FIGURES: dict[str, Measure] = {
     "turning movements": Measure(lambda t: _mean(_reached(t)["turning"]), ".1f"),
     "seconds": Measure(lambda t: _mean(_reached(t)["simulated_s"]), ".1f"),
     "error [deg]": Measure(lambda t: _mean(t["error_deg"])),
-    "off the axis, largest [deg]": Measure(lambda t: float(t["survivor_off_deg"].max()), ".1f"),
+    "off the axis, largest [deg]": Measure(lambda t: float(t["off_rotation_deg"][~t["lost"]].max()), ".1f"),
     "first motion [deg]": Measure(lambda t: _mean(t["first_step_deg"])),
     "KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "km"))),
     "E-KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "ekm"))),

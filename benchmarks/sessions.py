@@ -16,7 +16,7 @@ import torch
 from torch_ekm.control import Direction, FocusedPose, Manipulation, PoseTarget, StopReason
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.experiments.protocols.generalize import Generalize
-from torch_ekm.experiments.records import NotGrasped, Record, Trial, TrialRecord, true_state
+from torch_ekm.experiments.records import NOT_GRASPED, Trial, TrialRecord, true_state
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics import GraspState
 from torch_ekm.typing import Tensor
@@ -31,9 +31,9 @@ Row = dict[str, Any]
 Make = Callable[[str], Bench]
 
 
-def row(record: Record, **figures: Any) -> Row:
+def row(record: TrialRecord, **figures: Any) -> Row:
     """As JSON can keep it."""
-    return {"record": record.to_json(), **figures}
+    return {"record": vars(record), **figures}
 
 
 def turns(
@@ -60,7 +60,7 @@ def turns(
     made = []
     for trial, angle, kind in [*asked, *((k, angle, "turn") for k, angle in enumerate(angles))]:
         record = bench.trial(seed, trial, angle, kind)
-        if isinstance(record, TrialRecord) and bench.last is not None:
+        if record.grasped and bench.last is not None:
             made.append(
                 row(record, bands=_bands(bench.last, bench.hand.rotation_axis), **_readings(bench.last))
             )
@@ -285,7 +285,8 @@ def foresight(
         start = bench.grasp(seed, _BLIND if options else _FAR)
         about = Trial(bench.name, "turn", bench.controller, seed, _FAR, blind if options else far)
         if start is None:
-            made.append(row(NotGrasped(**vars(about), message=bench.no_grasp), part=part))
+            missed = TrialRecord(**vars(about), reason=NOT_GRASPED, message=bench.no_grasp)
+            made.append(row(missed, part=part))
             continue
         reach, ends = (math.nan, "") if options else _reach(bench, far)
         record = bench.turn(about, start, **options)

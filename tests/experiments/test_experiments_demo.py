@@ -41,8 +41,7 @@ def report(folder: Path) -> Report:
 @pytest.fixture(scope="module")
 def records(report: Report, folder: Path) -> list[TrialRecord]:
     kept = [read_result(path, path.stem) for path in sorted((folder / "runs").glob("*.json"))]
-    found = [TrialRecord.from_json(figures) for session in kept for figures in session]
-    return [record for record in found if isinstance(record, TrialRecord)]
+    return [TrialRecord.from_json(figures) for session in kept for figures in session]
 
 
 def test_every_target_is_approached_and_reached_by_the_enhanced_model(records: list[TrialRecord]) -> None:
@@ -90,7 +89,7 @@ def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Pat
     assert configuration["experiment"]["objects"] == ["box"]
     assert configuration["versions"]["torch"]
     by_angle = next(table for table in report.tables if table.name == "by_angle")
-    assert [row[0] for row in by_angle.rows] == [9.0, 14.0]
+    assert [row[0] for row in by_angle.rows] == ["9", "14", "all"]
 
 
 def test_a_finished_demo_is_not_run_again(
@@ -109,7 +108,6 @@ def test_the_demo_is_a_preset_of_generalize_and_repeats_itself(records: list[Tri
     generalize = dataclasses.replace(EXPERIMENT.protocol, angles_deg=(9.0,))
     (turn,) = generalize.session("box", "E-KM", 1)
     ours = next(r for r in records if (r.controller, r.seed, r.trial) == ("E-KM", 1, 0))
-    assert isinstance(turn, TrialRecord)
     assert turn.errors_deg == ours.errors_deg
     assert list(turn.poses) == list(ours.poses)
     assert len(turn.poses) == turn.steps + 1

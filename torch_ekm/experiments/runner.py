@@ -31,7 +31,7 @@ from ..residual import ResidualLearner
 from ..simulation import DisturbedPlant, PlantChange, SimulatedHand, Tug
 from .config import Setting, object_name
 from .learners import DEFAULT_LEARNER, make_learner
-from .records import NotGrasped, Record, Trial, TrialRecord
+from .records import NOT_GRASPED, Trial, TrialRecord
 
 _DEG = math.pi / 180
 _TRIES = 4  # grasps drawn for one trial before it is given up
@@ -110,23 +110,22 @@ class Bench:
         self._failed += 1
         return None
 
-    def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
+    def trial(
+        self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any
+    ) -> TrialRecord:
         """Turn the object by ``angle_deg`` from a fresh grasp, with the options of :meth:`turn`."""
         start = self.grasp(seed, trial)
         about = Trial(self.name, kind, self.controller, seed, trial, angle_deg)
         if start is None:
-            return NotGrasped(**vars(about), message=self.no_grasp)
+            return TrialRecord(**vars(about), reason=NOT_GRASPED, message=self.no_grasp)
         return self.turn(about, start, **options)
 
-    def learn_hand(self, seed: int) -> list[Record]:
+    def learn_hand(self, seed: int) -> list[TrialRecord]:
         """Thirty motions with this object, in turns to and fro, for the knowledge of the hand."""
-        records: list[Record] = []
-        motions = 0
-        while motions < _MOTIONS and len(records) < _MOST_TURNS:
+        records: list[TrialRecord] = []
+        while sum(one.steps for one in records) < _MOTIONS and len(records) < _MOST_TURNS:
             k = len(records)
-            one = self.trial(seed, _FIRST_GRASP + k, _LEARNS_BY[k % len(_LEARNS_BY)], "first")
-            motions += one.steps if isinstance(one, TrialRecord) else 0
-            records.append(one)
+            records.append(self.trial(seed, _FIRST_GRASP + k, _LEARNS_BY[k % len(_LEARNS_BY)], "first"))
         return records
 
     def turn(
@@ -166,7 +165,11 @@ class Bench:
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
                 **{"touch": False, **blind},
             )
-        self.last = _whole(self.closed_loop(plant, focus, learn=learn).run(target))
+        self.last = self.closed_loop(plant, focus, learn=learn).run(target)
+        if (
+            self.last.stop.cause is not None
+        ):  # one that Ctrl-C or a failure of the plant cut short is no trial
+            raise self.last.stop.cause
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
     def close(self) -> None:
@@ -217,10 +220,3 @@ def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, k
         hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
     rested = FramesAtRest(sensed, setting.frames)
     return rested if hall is None else ContactAligned(rested, hand, simulated.object)
-
-
-def _whole(done: Manipulation) -> Manipulation:
-    """One that Ctrl-C or a failure of the plant has cut short is no trial."""
-    if done.stop.cause is not None:
-        raise done.stop.cause
-    return done

@@ -90,7 +90,7 @@ def record(
 def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:
     assert isinstance(bench.plant, RecordingPlant)
     try:
-        outcome = bench.trial(seed, trial, angle).to_json()
+        outcome = dict(vars(bench.trial(seed, trial, angle)))
     except EKMError as error:  # kept, or the run would stop at this trial each time
         outcome = {"reason": type(error).__name__, "message": str(error)}
     outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs
