@@ -132,20 +132,9 @@ def axes_of(bench: Bench) -> dict[str, Tensor]:
 
 
 def there_and_back(
-    make: Make,
-    items: Sequence[str],
-    seed: int,
-    *,
-    learns_by: Sequence[float],
-    angle: float,
-    times: int,
-    within: float | None,
+    make: Make, items: Sequence[str], seed: int, *, learns_by: Sequence[float], angle: float, times: int
 ) -> list[Row]:
-    """One grasp turned to ``angle`` and back until the object is lost; the same turns from fresh grasps.
-
-    Args:
-        within: on the way back the position along the grip is asked for, too, to so many mm.
-    """
+    """One grasp turned to ``angle`` and back until the object is lost; the same turns from fresh grasps."""
     bench = _warmed(make, items[0], seed, learns_by)
     start, made = bench.grasp(seed, 0), []
     before = bench.hand.observe() if start is not None else None
@@ -153,11 +142,8 @@ def there_and_back(
         if start is None or before is None:
             break
         axes, back = axes_of(bench), k % 2 == 1
-        focus = None
-        if back and within is not None:
-            focus = FocusedPose([Direction(axes["a"], "deg"), Direction(axes["b"], "mm", tolerance=within)])
         about = Trial(bench.name, "turn", bench.controller, seed, k, 0.0 if back else angle)
-        record = bench.turn(about, start, focus=focus)
+        record = bench.turn(about, start)
         assert bench.last is not None
         states = true_state(before), true_state(bench.last.stop.final)
         shift = {name: 1e3 * float(axes[name] @ (states[1].position - states[0].position)) for name in "abc"}

@@ -19,7 +19,6 @@ from default_streams import (
     from_rest,
     jumping,
     noisy_side,
-    product_of_two,
     pure_noise,
     streams,
     there_and_back,
@@ -169,21 +168,6 @@ def _without_outliers(samples: Samples) -> Tensor:
     return torch.where(hit, samples.clean + noise, samples.y)
 
 
-def overfitting(n: int, seeds: Sequence[int], capacity: int) -> None:
-    """The product of two of 32 inputs: the deep learner compared with the plain one."""
-    print(
-        f"\n| product of two of 32 inputs, {capacity} points | error of y | coverage of 90 % |\n|---|---|---|"
-    )
-    for name, make in (("SparseOnlineGP", SparseOnlineGP), ("DeepKernelSOGP", DeepKernelSOGP)):
-        found = []
-        for seed in seeds:
-            samples = product_of_two(n, seed)
-            r = run(make, samples, capacity=capacity)
-            found.append((ratio(r.mean[n // 2 :], samples.y[n // 2 :]), float(r.coverage(n // 2).mean())))
-        error, coverage = np.mean(found, 0)
-        print(f"| {name} | {error:.3f} | {100 * coverage:.0f} % |", flush=True)
-
-
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=parse_seeds, default=(0,), help="FIRST:END")
@@ -195,12 +179,10 @@ def main(arguments: list[str] | None = None) -> None:
     if options.quick:
         table(30, options.seeds[:1], ("smooth",))
         bars(30, options.seeds[:1])
-        overfitting(30, options.seeds[:1], 15)
         return
     table(options.samples, options.seeds, options.stream)
     if not options.stream:
         bars(options.samples, options.seeds)
-        overfitting(7000, options.seeds, 300)
 
 
 if __name__ == "__main__":

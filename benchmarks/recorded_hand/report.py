@@ -28,7 +28,7 @@ def write_report(result: RecordedHandResult, folder: str | Path) -> Report:
     figure = save_figure(plot_paths(result, names), Path(folder), "paths", caption)
     horizons = sorted(HORIZONS, reverse=True)
     tables = [score_table(result, horizon, subset) for subset in SUBSETS for horizon in horizons]
-    configuration = {"apart": APART, "objects": result.reported, "calibration": result.calibration}
+    configuration = {"apart": APART, "objects": result.reported, "calibration": str(result.calibration)}
     title = "Recorded motions of a Yale T42, predicted"
     report = Report(title, summary(result), tables, [figure], configuration=configuration)
     report.write(Path(folder))
