@@ -17,7 +17,7 @@ from torch_ekm.experiments import Columns, compare, load_own
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.run import run_one
-from torch_ekm.experiments.learner_comparison.stream import Stream, in_own_units, load_table
+from torch_ekm.experiments.learner_comparison.stream import Stream, load_table
 from torch_ekm.experiments.learner_comparison.table_file import open_table
 from torch_ekm.experiments.learners import learner_factory
 from torch_ekm.residual import UpdateReport, ZeroResidual
@@ -25,6 +25,10 @@ from torch_ekm.residual import UpdateReport, ZeroResidual
 
 def table(n: int = 60) -> np.ndarray:
     return np.random.default_rng(0).normal(size=(n, 4))
+
+
+def stream_of(x: np.ndarray, y: np.ndarray, **options: bool) -> Stream:
+    return Stream("a", torch.tensor(x), torch.tensor(y)).stream(**options)
 
 
 def write(path: Path, values: np.ndarray, names: str = "a,b,c,y") -> Path:
@@ -205,7 +209,7 @@ def test_columns_that_are_not_asked_for_may_hold_anything(kind: str, tmp_path: P
         columns = {"day": ["monday"] * 60, **dict(zip("abcy", values.T, strict=True)), "note": [None] * 60}
         parquet.write_table(pyarrow.table(columns), path)
     chosen = load_table(path, inputs=["c", "a"])
-    given = in_own_units("a", values[:, [2, 0]], values[:, 3:], centre_y=False)
+    given = stream_of(values[:, [2, 0]], values[:, 3:])
     torch.testing.assert_close(chosen.x, given.x)
     torch.testing.assert_close(chosen.y, given.y)
     with pytest.raises(DescriptionError, match="column 'day'"):
@@ -220,7 +224,7 @@ def test_y_is_measured_less_predicted_and_runs_stand_for_themselves(tmp_path: Pa
     values = np.column_stack([np.arange(60), table(), np.arange(60) // 10])
     path = write(tmp_path / "a.csv", values, ",a,b,said,seen,run")  # as pandas writes it, its index first
     stream = load_table(path, ["seen"], predicted=["said"], run="run")
-    given = in_own_units("a", values[:, 1:3], values[:, 4:5] - values[:, 3:4], centre_y=False)
+    given = stream_of(values[:, 1:3], values[:, 4:5] - values[:, 3:4])
     torch.testing.assert_close(stream.x, given.x)
     torch.testing.assert_close(stream.y, given.y)
     assert stream.segments == (10,) * 6
@@ -319,7 +323,7 @@ def test_a_run_begins_a_sequence(tmp_path: Path) -> None:
 def test_rest_at_the_beginning_is_no_unit() -> None:
     moving = table(300)
     moving[:40] *= 1e-5
-    stream = in_own_units("a", moving[:, :3], moving[:, 3:])
+    stream = stream_of(moving[:, :3], moving[:, 3:], centre=True)
     assert max(float(stream.x.abs().max()), float(stream.y.abs().max())) < 6
 
 
@@ -367,7 +371,7 @@ def test_units_come_from_the_warm_up_alone() -> None:
     values = table(300)
     changed = values.copy()
     changed[100:] *= 50.0
-    one, two = (in_own_units("a", v[:, :3], v[:, 3:]) for v in (values, changed))
+    one, two = (stream_of(v[:, :3], v[:, 3:], centre=True) for v in (values, changed))
     assert one.warm_up == 30
     torch.testing.assert_close(one.x[:100], two.x[:100], rtol=0, atol=0)
     torch.testing.assert_close(one.y[:100], two.y[:100], rtol=0, atol=0)

@@ -137,7 +137,6 @@ class Bench:
         events: Sequence[Tug | PlantChange] = (),
         blind_deg: float = 0.0,
         poses: bool = False,
-        focus: FocusedPose | None = None,
         **blind: Any,
     ) -> TrialRecord:
         """Turn the object that is held.
@@ -148,7 +147,6 @@ class Bench:
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
             poses: keep the true poses, for pictures.
-            focus: what of the turned pose is to be reached; None: the rotation about the hand's axis.
             blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
         now = self.disturbed.count
@@ -165,7 +163,7 @@ class Bench:
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
                 **{"touch": False, **blind},
             )
-        self.last = self.closed_loop(plant, focus, learn=learn).run(target)
+        self.last = self.closed_loop(plant, learn=learn).run(target)
         if (
             self.last.stop.cause is not None
         ):  # one that Ctrl-C or a failure of the plant cut short is no trial

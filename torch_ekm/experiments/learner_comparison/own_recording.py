@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from ...exceptions import DescriptionError, ShapeError
-from ...typing import Array, Float, Tensor
-from .stream import LEAST, Stream, in_own_units
+from ...typing import Array
+from .stream import LEAST, Stream
 from .table_file import find_columns, open_table
 
 #: ``f(state, command) -> increment of the observation`` of all motions at once, ``(n, .)`` each.
@@ -33,44 +33,17 @@ class Columns:
     observation: Sequence[str]
 
 
-@dataclass(frozen=True)
-class OwnRecording:
-    """Motions of a recording: ``y = o(t + 1) - o(t) - f(s(t), u(t))``, from each row to the next.
-
-    Attributes:
-        name: of the file.
-        x: state and command ``(n, d)``, in the recording's units.
-        y: what the model left over ``(n, m)``, in the units of the observation.
-        about: what it is, and what "the model alone" predicts.
-        outputs: the observed columns.
-        notes: which rows are left out and why, and what was found of clocks.
-    """
-
-    name: str
-    x: Float[Tensor, "n d"]
-    y: Float[Tensor, "n m"]
-    about: str
-    outputs: tuple[str, ...] = ()
-    notes: str = ""
-
-    def stream(self, limit: int | None = None) -> Stream:
-        """For :func:`compare`: the first ``limit`` motions (None: all), in units of their first tenth.
-
-        That (20 to 200 samples) is not scored. Only x is centred: 0 is what the model says.
-        """
-        x, y = self.x.numpy(), self.y.numpy()
-        found = in_own_units(self.name, x, y, self.about, limit, outputs=self.outputs, centre_y=False, ddof=1)
-        return replace(found, notes=self.notes)
-
-
 def load_own(
     path: str | Path,
     columns: Columns,
     model: Model | None = None,
     *,
     clock: str | None = None,
-) -> OwnRecording:
-    """Motions from CSV, Parquet, or a recording of ROS (MCAP, sqlite3, .bag).
+) -> Stream:
+    """Motions from CSV, Parquet, or a recording of ROS (MCAP, sqlite3, .bag), in the units of the file.
+
+    From each row to the next, ``y = o(t + 1) - o(t) - f(s(t), u(t))``; x holds state and command. Its
+    :meth:`Stream.stream` is what learners are compared on.
 
     Args:
         path: the file, or the folder of rosbag2; rows in the order of time. No motion goes over a row that
@@ -102,4 +75,4 @@ def load_own(
     alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
     about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
     x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
-    return OwnRecording(path.stem, x, y, about, tuple(outputs), notes)
+    return Stream(path.stem, x, y, about=about, notes=notes, outputs=tuple(outputs))

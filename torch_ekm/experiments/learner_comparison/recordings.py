@@ -16,7 +16,7 @@ from ..._extras import require
 from ...exceptions import DescriptionError, EKMError, ParameterError, UnknownNameError
 from ...typing import Array
 from .own_recording import Columns, load_own
-from .stream import Stream, in_own_units, load_table
+from .stream import Stream, load_table
 
 LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
 
@@ -156,8 +156,8 @@ def _table(name: str, limit: int | None) -> Stream:
     else:
         comma = "," if "csv" in file.name or name == "mimo" else None
         values = np.loadtxt(file, delimiter=comma, skiprows=1 if file.suffix == ".csv" else 0)
-    x, y = split(values)
-    return in_own_units(name, x, y, about, limit)
+    x, y = map(torch.from_numpy, map(np.array, split(values)))
+    return Stream(name, x, y, about=about).stream(limit, centre=True)
 
 
 def _need(path: str) -> Path:
