@@ -27,13 +27,12 @@ _FIRST_GRASP = 1000  # its number, of the turns in which a hand is learned: neve
 _FAR, _BLIND = 3000, 4000  # numbers of the grasps of the turns that go as far as they can, and blind
 _LEAST_ASKED = 0.01 * _DEG  # of a motor that is to move
 _MADE = 0.8  # of a movement: one that was ended on its way says nothing of the band at its end
-Row = dict[str, Any]
 Make = Callable[[str], Bench]
 
 
-def row(record: TrialRecord, **figures: Any) -> Row:
-    """As JSON can keep it."""
-    return {"record": vars(record), **figures}
+def row(record: TrialRecord, **figures: Any) -> TrialRecord:
+    """A record with figures of its own."""
+    return replace(record, more=figures)
 
 
 def turns(
@@ -44,7 +43,7 @@ def turns(
     angles: Sequence[float] | None,
     learns_by: Sequence[float] | int = (),
     all_learn: bool = False,
-) -> list[Row]:
+) -> list[TrialRecord]:
     """Turns of an object from fresh grasps, after those in which the hand is learned.
 
     Args:
@@ -101,7 +100,7 @@ def _readings(done: Manipulation) -> dict[str, float]:
     }
 
 
-def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence[float]) -> list[Row]:
+def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence[float]) -> list[TrialRecord]:
     """Thirty motions with the first object; turns of the others, which the hand has never held."""
     records, knowledge = [], None
     for k, item in enumerate(items):
@@ -111,7 +110,7 @@ def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence
             [bench.trial(seed, j, angle) for j, angle in enumerate(angles)] if k else bench.learn_hand(seed)
         )
         bench.close()
-    return [row(one) for one in records]
+    return records
 
 
 def _warmed(make: Make, item: str, seed: int, angles: Sequence[float]) -> Bench:
@@ -133,7 +132,7 @@ def axes_of(bench: Bench) -> dict[str, Tensor]:
 
 def there_and_back(
     make: Make, items: Sequence[str], seed: int, *, learns_by: Sequence[float], angle: float, times: int
-) -> list[Row]:
+) -> list[TrialRecord]:
     """One grasp turned to ``angle`` and back until the object is lost; the same turns from fresh grasps."""
     bench = _warmed(make, items[0], seed, learns_by)
     start, made = bench.grasp(seed, 0), []
@@ -153,7 +152,7 @@ def there_and_back(
         if record.lost:
             break
     for k in range(1, 1 + min(times, 5)):
-        made += [row(bench.trial(seed, k, angle), part="fresh grasps", back=False)]
+        made.append(row(bench.trial(seed, k, angle), part="fresh grasps", back=False))
     bench.close()
     return made
 
@@ -224,7 +223,7 @@ def directions(
     groups: Sequence[str],
     within: dict[str, float],
     stricter: float,
-) -> list[Row]:
+) -> list[TrialRecord]:
     """Every target from a grasp of its own; what the model finds out of reach is declined.
 
     Args:
@@ -260,7 +259,7 @@ def directions(
 
 def foresight(
     make: Make, items: Sequence[str], seed: int, *, learns_by: Sequence[float], far: float, blind: float
-) -> list[Row]:
+) -> list[TrialRecord]:
     """Turns without the camera, by touch and by prediction; then as far as the grasp goes, predicted."""
     bench, made = _warmed(make, items[0], seed, learns_by), []
     dark = {"learn": False, "blind_deg": math.inf}

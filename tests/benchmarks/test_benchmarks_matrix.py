@@ -38,8 +38,9 @@ def row(reason: str, turning: int, off: float = 1.0, ekm: tuple[float, ...] = ()
     record = TrialRecord(
         "box", "turn", "E-KM", 0, 1, 27.0, reason, "", 0.1, (27.0, 0.1), 0.1, (), (), (0.5,) * len(ekm),
         ekm, off, (0.01,) * (turning + 1), turning=turning, simulated_s=0.5 * turning,
+        more=figures,
     )  # fmt: skip
-    return {"record": vars(record), **figures}
+    return vars(record)
 
 
 def test_every_family_has_three_strengths_that_differ_from_the_nominal_hand() -> None:
@@ -100,7 +101,7 @@ def test_lost_reached_movements_and_bands_are_counted() -> None:
 
 def test_an_end_without_a_grasp_is_no_turn() -> None:
     lost = TrialRecord("box", "turn", "KM", 0, 1, 9.0, NOT_GRASPED, "too wide")
-    rows = [{"record": vars(lost)}, row("reached", 1)]
+    rows = [vars(lost), row("reached", 1)]
     assert len(frame_of({"a": rows}, {"a": ("nominal", "KM")})) == 1
 
 
@@ -184,9 +185,8 @@ def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.Monkey
 
     setting = Setting(hand="planar_two_finger", engine="mujoco").hardware_instance(3)
     made = new_objects(lambda item: Noted(setting, item, "E-KM"), ["box", "can"], 3, angles=(4.0,))
-    records = [one["record"] for one in made]
-    assert [(one["object"], one["kind"]) for one in records][-1] == ("can", "turn")
-    assert {(one["object"], one["kind"]) for one in records[:-1]} == {("box", "first")}
+    assert (made[-1].object, made[-1].kind) == ("can", "turn")
+    assert {(one.object, one.kind) for one in made[:-1]} == {("box", "first")}
     (_, none, _), *_, (item, known, learner) = grasps
     assert none == 0
     assert (item, learner) == ("can", None)  # the object's own learner is empty

@@ -6,14 +6,12 @@ import dataclasses
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.control import Safety, StoppingRule
-from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.exceptions import UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.jobs import read_result
 from torch_ekm.experiments.protocols.demo import Demo
@@ -125,17 +123,8 @@ def test_results_are_named_by_the_model_that_is_run() -> None:
 def test_wrong_names_list_the_right_ones() -> None:
     with pytest.raises(UnknownNameError, match="weighted_box"):
         Demo(objects=("spoon",))
-    with pytest.raises(UnknownNameError, match="icub_left"):
-        Demo(Setting(hand="icub"))
-    with pytest.raises(ParameterError, match="angles_deg"):
-        Demo(angles_deg=(200.0,))
     with pytest.raises(UnknownNameError, match="E-KM"):
         EXPERIMENT.protocol.session("box", "PID", 0)
-
-
-def test_small_version() -> None:
-    assert Demo(objects=("can",)).quick().angles_deg == (9, 13)
-    assert np.all(np.array(Demo().quick().angles_deg) == (9, 14))
 
 
 @pytest.mark.parametrize("command", [["--help"], ["demo", "--help"], ["hands"], ["objects"], ["version"]])
@@ -143,11 +132,3 @@ def test_command_line_explains_itself(command: list[str]) -> None:
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 0, result.output
     assert len(result.output) > 50
-
-
-def test_seeds_are_parsed() -> None:
-    assert parse_seeds("1000:1003") == (1000, 1001, 1002)
-    assert parse_seeds("7") == (7,)
-    for text in ("a", "3:1", "1:2:3", "", "2147483648"):
-        with pytest.raises(ParameterError, match=r"FIRST:END .* or one number below that"):
-            parse_seeds(text)

@@ -74,6 +74,8 @@ class TrialRecord(Trial):
     """Movements that turn; the others only grip."""
     simulated_s: float = 0.0
     """From the first reading to the last, by the plant's clock [s]."""
+    more: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Figures of a study; each is a column of the frame."""
 
     @property
     def grasped(self) -> bool:

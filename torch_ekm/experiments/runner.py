@@ -49,15 +49,12 @@ class Bench:
     Args:
         object: name, path or description.
         controller: one of ``CONTROLLERS``.
-        keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
     """
 
     controllers: ClassVar[type[LookAndMoveController]] = LookAndMoveController
     loops: ClassVar[type[ClosedLoop]] = ClosedLoop
 
-    def __init__(
-        self, setting: Setting, object: str | ObjectDescription, controller: str, *, keep_images: bool = False
-    ) -> None:
+    def __init__(self, setting: Setting, object: str | ObjectDescription, controller: str) -> None:
         torch.set_num_threads(1)  # small matrices: more threads only wait for each other
         self.setting, self.controller = setting, controller
         config = setting.plant_config(controller)
@@ -66,7 +63,7 @@ class Bench:
         self.disturbed = DisturbedPlant(self.hand)
         self.plant: Plant = self.disturbed
         if setting.sensing:
-            self.plant = _sensed(self.disturbed, self.hand, setting, keep_images)
+            self.plant = _sensed(self.disturbed, self.hand, setting)
         else:
             self.plant = FramesAtRest(self.plant, setting.frames)
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
@@ -207,13 +204,13 @@ class Bench:
         )
 
 
-def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, keep_images: bool) -> Plant:
+def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting) -> Plant:
     from ..sensing import ContactAligned  # OpenCV is needed only here
     from ..simulation import HallSensors, SensedPlant
 
     hand, stuck = simulated.hand, setting.parameters.stuck_joints
     hall = HallSensors(hand) if hand.hall_sensors else None
-    sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
+    sensed = SensedPlant(plant, hand, simulated.object, hall=hall)
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
         hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
     rested = FramesAtRest(sensed, setting.frames)

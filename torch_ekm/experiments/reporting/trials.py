@@ -32,8 +32,12 @@ def trial_frame(results: Mapping[str, Iterable[TrialRecord]]) -> DataFrame:
     Args:
         results: job -> its records.
     """
-    rows = [{"job": job, **vars(one), **_added(one)} for job, records in results.items() for one in records]
-    return require("pandas").DataFrame(rows)
+    rows = [
+        {"job": job, **vars(one), **_added(one), **one.more}
+        for job, records in results.items()
+        for one in records
+    ]
+    return require("pandas").DataFrame(rows).drop(columns="more")
 
 
 def select(trials: DataFrame, **wanted: Any) -> DataFrame:
