@@ -162,7 +162,7 @@ def test_a_learner_sees_each_sample_after_its_prediction(result):
 def test_the_page_has_its_tables_and_pictures(result, tmp_path):
     report = write_report(result, tmp_path)
     assert (tmp_path / "index.html").stat().st_size > 10_000
-    assert [figure.path for figure in report.figures] == ["paths.svg"]
+    assert [figure.path for figure in report.figures] == ["scores.svg", "paths.svg"]
     names = {table.name for table in report.tables}
     assert names == {f"scores_{h}_{s}" for h in (10, 50) for s in ("all", "first")}
     with pytest.raises(UnknownNameError, match="no model"):

@@ -78,13 +78,9 @@ def test_the_learner_helps_on_a_real_hand():
 
 
 @pytest.mark.slow
-def test_the_benchmark_of_the_default_learner_runs(capsys):
-    default_learner.main(["--quick"])
+def test_the_benchmark_of_the_default_learner_runs(tmp_path, capsys):
+    default_learner.main(["--quick", "--out", str(tmp_path)])
     told = capsys.readouterr().out
-    for row in (
-        "| smooth |",
-        "| pure noise, error",
-        "| jump of 3 sd",
-        "| arm at 100 Hz",
-    ):
+    for row in ("| smooth |", "| pure noise, error", "| jump of 3 sd", "| arm at 100 Hz"):
         assert row in told
+    assert (tmp_path / "streams.svg").exists()
