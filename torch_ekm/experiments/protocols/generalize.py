@@ -169,21 +169,16 @@ def paper_table(trials: DataFrame) -> Table:
     return Table("paper", "The paper's Table II, and the same here", columns, rows, note)
 
 
-def cell_errors(trials: DataFrame) -> tuple[DataFrame, DataFrame]:
-    """Errors of E-KM and KM [deg], a row for each cell (object and target), a column for each hand."""
-    turns, cells = select(trials, kind="turn"), ["object", "trial", "angle_deg"]
-    ekm, km = (
-        select(turns, controller=name).pivot_table("error_deg", cells, "seed", sort=False)
-        for name in ("E-KM", "KM")
-    )
-    return ekm.align(km, join="inner")
-
-
 def significance_table(trials: DataFrame) -> Table:
     """Cells that the E-KM wins on a hand, and the tests of its errors, of the paper's objects if any."""
     both = trials[trials["object"].isin(list(TABLE_II))]
     chosen, rows = both if len(both) else trials, []
-    ekm, km = cell_errors(chosen)
+    turns, cells = select(chosen, kind="turn"), ["object", "trial", "angle_deg"]
+    ekm, km = (  # a row for each cell, a column for each hand
+        select(turns, controller=name).pivot_table("error_deg", cells, "seed", sort=False)
+        for name in ("E-KM", "KM")
+    )
+    ekm, km = ekm.align(km, join="inner")
     seeds = (ekm - km).dropna(axis=1).columns
     if len(seeds) and len(ekm) > 1:
         hands = [(ekm[seed].to_numpy(), km[seed].to_numpy()) for seed in seeds]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -199,7 +199,7 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
             f"{name} {turns[name]['lost'].sum()} and {turns[name]['not_reached'].sum()} of {len(turns[name])}"
             for name in order
         ]
-        parts.append(f"The {', '.join([first, *ends[1:]])}, on {_counted(len(seeds), 'seed')}.")
+        parts.append(f"The {', '.join([first, *ends[1:]])}, on {len(seeds)} seed{'s' * (len(seeds) > 1)}.")
         parts.append(f"Objects lost, and turns that did not reach the target: {', '.join(failed)}.")
         if 2 * (turns[order[0]]["reason"] == _REACHED).sum() < len(turns[order[0]]):
             parts.append(f"The {order[0]}: {why(turns[order[0]])}")
@@ -212,7 +212,9 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
         ratios = [f"{name} {100 * ratio:.0f} %" for name, ratio in found.items() if ratio is not None]
         if ratios:
             parts.append(f"Error of the E-KM over that of {', '.join(ratios)} (paired).")
-    parts += [f"{name} was never grasped ({why})." for name, why in _never_grasped(trials).items()]
+    for name, mine in trials[trials["kind"] == "turn"].groupby("object", sort=False):
+        if not mine["grasped"].any():
+            parts.append(f"{name} was never grasped ({mine['message'].iloc[-1]}).")
     return f"{' '.join(parts) or 'Nothing to compare.'} {which_seeds(seeds)}"
 
 
@@ -221,16 +223,6 @@ def why(turns: DataFrame) -> str:
     reasons = turns["reason"].value_counts()
     said = turns.loc[turns["reason"] == reasons.index[0], "message"].mode()[0]
     return f"{reasons.iloc[0]} of {len(turns)} turns ended with '{reasons.index[0]}'{said and f': {said}'}."
-
-
-def _counted(n: int, what: str) -> str:
-    return f"{n} {what}{'' if n == 1 else 's'}"
-
-
-def _never_grasped(trials: DataFrame) -> Mapping[str, str]:
-    """Objects that no turn could hold, with the reason of the last try."""
-    turns = trials[trials["kind"] == "turn"].groupby("object", sort=False)
-    return {str(name): mine["message"].iloc[-1] for name, mine in turns if not mine["grasped"].any()}
 
 
 def which_seeds(seeds: Sequence[int]) -> str:
