@@ -93,16 +93,13 @@ def group_table(trials: DataFrame, by: str, what: str) -> Table:
     for key, mine in {**groups, "all": turns}.items():
         found = by_controller(mine)
         errors = [stats.estimate(found[name], "error_deg") if name in found else None for name in names]
-        ends = [
-            f"{found[name]['lost'].sum()}, {found[name]['not_reached'].sum()}" if name in found else None
-            for name in names
-        ]
+        ends = (f"{name} {of['lost'].sum()}, {of['not_reached'].sum()}" for name, of in found.items())
         compared = ratio_and_p(*paired(mine, "E-KM", "KM", "error_deg"), mine["seed"].nunique())
-        rows.append([key, *errors, *compared, *ends])
+        rows.append([key, *errors, *compared, "; ".join(ends)])
     columns = [
         by.replace("_deg", " [deg]"), *(f"{name} [deg]" for name in names),
         Column("E-KM:KM [%]", ".0f", percent=True), Column("p paired", ".1g"),
-        *(f"{name} lost, not reached" for name in names),
+        "lost, not reached",
     ]  # fmt: skip
     note = (
         "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
