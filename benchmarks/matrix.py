@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas
 from contenders import Contender
 from hands import CONDITIONS, Hand, hands
 
@@ -30,7 +29,7 @@ from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.experiments.reporting.trials import trial_frame
+from torch_ekm.experiments.reporting.trials import select, trial_frame
 from torch_ekm.simulation import ENGINES
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ class Question:
     """What is asked of the matrix."""
 
     title: str
-    session: Callable[..., list[dict[str, Any]]]
+    session: Callable[..., list[TrialRecord]]
     contenders: Mapping[str, Contender]
     hands: str = "nominal"
     """Names of :func:`hands.hands`."""
@@ -127,7 +126,7 @@ FIGURES: dict[str, Measure] = {
     "turning movements": Measure(lambda t: _mean(_reached(t)["turning"]), ".1f"),
     "seconds": Measure(lambda t: _mean(_reached(t)["simulated_s"]), ".1f"),
     "error [deg]": Measure(lambda t: _mean(t["error_deg"])),
-    "off the axis, largest [deg]": Measure(lambda t: float(t["survivor_off_deg"].max()), ".1f"),
+    "off the axis, largest [deg]": Measure(lambda t: float(t["off_rotation_deg"][~t["lost"]].max()), ".1f"),
     "first motion [deg]": Measure(lambda t: _mean(t["first_step_deg"])),
     "KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "km"))),
     "E-KM, first 5 [deg]": Measure(lambda t: _mean(early(t, "ekm"))),
@@ -158,21 +157,17 @@ def _last(turns: Frame) -> Frame:
 def frame_of(
     results: Mapping[str, Sequence[Mapping[str, Any]]], keys: Mapping[str, tuple[str, str]]
 ) -> Frame:
-    """A row for each trial with a grasp: figures of the record and of the session, plant and contender.
+    """A row for each trial with a grasp: its record's figures, plant and contender.
 
     Args:
         results: what sessions left, by job.
         keys: plant and contender of each job.
     """
-    rows = [(job, one) for job, session in results.items() for one in session]
-    records = {str(k): [TrialRecord.from_json(one["record"])] for k, (_, one) in enumerate(rows)}
-    trials = trial_frame(records)
-    more = pandas.DataFrame([{k: v for k, v in one.items() if k != "record"} for _, one in rows])
-    plant, contender = zip(*(keys[job] for job, _ in rows), strict=True)
-    found = pandas.concat([trials, more, pandas.DataFrame({"plant": plant, "contender": contender})], axis=1)
+    found = select(trial_frame({job: map(TrialRecord.from_json, one) for job, one in results.items()}))
+    found["plant"], found["contender"] = zip(*found["job"].map(keys), strict=True)
     if "part" in found:
         found["case"] = found["contender"] + ", " + found["part"]
-    return found[found["grasped"].astype(bool)].reset_index(drop=True)
+    return found.reset_index(drop=True)
 
 
 def table(turns: Frame, by: str, columns: Sequence[str], name: str, title: str, note: str = "") -> Table:
@@ -278,7 +273,9 @@ def session(
 ) -> list[dict[str, Any]]:
     """What one job leaves."""
     own = one.setting(setting).hardware_instance(seed)
-    return make(lambda item: one.bench(own, item, one.controller), items, seed, **options)
+    return [
+        vars(each) for each in make(lambda item: one.bench(own, item, one.controller), items, seed, **options)
+    ]
 
 
 def jobs(

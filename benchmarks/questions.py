@@ -49,26 +49,20 @@ _WHOLE_TURN = Question(
     more=(_first, _ends, bands_table),
     quick={"angles": (5.0,), "learns_by": (4.0,)},
 )
-_SERIES = Question(
-    "Turns without a new grasp",
-    there_and_back,
-    {"E-KM": Contender()},
-    options={"learns_by": (9.0, -9.0, 15.0), "angle": 15.0, "times": 20, "within": None},
-    by="part",
-    columns=(*_ENDS[:4], "along the grip, last [mm]", "contacts slid, last [mm]", "other ends"),
-    split="object",
-    quick={"learns_by": (), "angle": 6.0, "times": 1},
-)
 QUESTIONS: dict[str, Question] = {
     "whole_turn": _WHOLE_TURN,
     "plan": dataclasses.replace(
         _WHOLE_TURN, title="Parts of the plan, on hands that lose objects", contenders=PLANS, hands="losing"
     ),
-    "series": _SERIES,
-    "series_undone": dataclasses.replace(
-        _SERIES,
-        title="Turns without a new grasp, the place along the grip asked for, too",
-        options={**_SERIES.options, "within": 0.4},
+    "series": Question(
+        "Turns without a new grasp",
+        there_and_back,
+        {"E-KM": Contender()},
+        options={"learns_by": (9.0, -9.0, 15.0), "angle": 15.0, "times": 20},
+        by="part",
+        columns=(*_ENDS[:4], "along the grip, last [mm]", "contacts slid, last [mm]", "other ends"),
+        split="object",
+        quick={"learns_by": (), "angle": 6.0, "times": 1},
     ),
     "directions": Question(
         "Focused poses of one to six directions",

@@ -16,7 +16,7 @@ import torch
 from torch_ekm.control import Direction, FocusedPose, Manipulation, PoseTarget, StopReason
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.experiments.protocols.generalize import Generalize
-from torch_ekm.experiments.records import NotGrasped, Record, Trial, TrialRecord, true_state
+from torch_ekm.experiments.records import NOT_GRASPED, Trial, TrialRecord, true_state
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics import GraspState
 from torch_ekm.typing import Tensor
@@ -27,13 +27,12 @@ _FIRST_GRASP = 1000  # its number, of the turns in which a hand is learned: neve
 _FAR, _BLIND = 3000, 4000  # numbers of the grasps of the turns that go as far as they can, and blind
 _LEAST_ASKED = 0.01 * _DEG  # of a motor that is to move
 _MADE = 0.8  # of a movement: one that was ended on its way says nothing of the band at its end
-Row = dict[str, Any]
 Make = Callable[[str], Bench]
 
 
-def row(record: Record, **figures: Any) -> Row:
-    """As JSON can keep it."""
-    return {"record": record.to_json(), **figures}
+def row(record: TrialRecord, **figures: Any) -> TrialRecord:
+    """A record with figures of its own."""
+    return replace(record, more=figures)
 
 
 def turns(
@@ -44,7 +43,7 @@ def turns(
     angles: Sequence[float] | None,
     learns_by: Sequence[float] | int = (),
     all_learn: bool = False,
-) -> list[Row]:
+) -> list[TrialRecord]:
     """Turns of an object from fresh grasps, after those in which the hand is learned.
 
     Args:
@@ -60,7 +59,7 @@ def turns(
     made = []
     for trial, angle, kind in [*asked, *((k, angle, "turn") for k, angle in enumerate(angles))]:
         record = bench.trial(seed, trial, angle, kind)
-        if isinstance(record, TrialRecord) and bench.last is not None:
+        if record.grasped and bench.last is not None:
             made.append(
                 row(record, bands=_bands(bench.last, bench.hand.rotation_axis), **_readings(bench.last))
             )
@@ -101,7 +100,7 @@ def _readings(done: Manipulation) -> dict[str, float]:
     }
 
 
-def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence[float]) -> list[Row]:
+def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence[float]) -> list[TrialRecord]:
     """Thirty motions with the first object; turns of the others, which the hand has never held."""
     records, knowledge = [], None
     for k, item in enumerate(items):
@@ -111,7 +110,7 @@ def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence
             [bench.trial(seed, j, angle) for j, angle in enumerate(angles)] if k else bench.learn_hand(seed)
         )
         bench.close()
-    return [row(one) for one in records]
+    return records
 
 
 def _warmed(make: Make, item: str, seed: int, angles: Sequence[float]) -> Bench:
@@ -132,20 +131,9 @@ def axes_of(bench: Bench) -> dict[str, Tensor]:
 
 
 def there_and_back(
-    make: Make,
-    items: Sequence[str],
-    seed: int,
-    *,
-    learns_by: Sequence[float],
-    angle: float,
-    times: int,
-    within: float | None,
-) -> list[Row]:
-    """One grasp turned to ``angle`` and back until the object is lost; the same turns from fresh grasps.
-
-    Args:
-        within: on the way back the position along the grip is asked for, too, to so many mm.
-    """
+    make: Make, items: Sequence[str], seed: int, *, learns_by: Sequence[float], angle: float, times: int
+) -> list[TrialRecord]:
+    """One grasp turned to ``angle`` and back until the object is lost; the same turns from fresh grasps."""
     bench = _warmed(make, items[0], seed, learns_by)
     start, made = bench.grasp(seed, 0), []
     before = bench.hand.observe() if start is not None else None
@@ -153,11 +141,8 @@ def there_and_back(
         if start is None or before is None:
             break
         axes, back = axes_of(bench), k % 2 == 1
-        focus = None
-        if back and within is not None:
-            focus = FocusedPose([Direction(axes["a"], "deg"), Direction(axes["b"], "mm", tolerance=within)])
         about = Trial(bench.name, "turn", bench.controller, seed, k, 0.0 if back else angle)
-        record = bench.turn(about, start, focus=focus)
+        record = bench.turn(about, start)
         assert bench.last is not None
         states = true_state(before), true_state(bench.last.stop.final)
         shift = {name: 1e3 * float(axes[name] @ (states[1].position - states[0].position)) for name in "abc"}
@@ -167,7 +152,7 @@ def there_and_back(
         if record.lost:
             break
     for k in range(1, 1 + min(times, 5)):
-        made += [row(bench.trial(seed, k, angle), part="fresh grasps", back=False)]
+        made.append(row(bench.trial(seed, k, angle), part="fresh grasps", back=False))
     bench.close()
     return made
 
@@ -238,7 +223,7 @@ def directions(
     groups: Sequence[str],
     within: dict[str, float],
     stricter: float,
-) -> list[Row]:
+) -> list[TrialRecord]:
     """Every target from a grasp of its own; what the model finds out of reach is declined.
 
     Args:
@@ -274,7 +259,7 @@ def directions(
 
 def foresight(
     make: Make, items: Sequence[str], seed: int, *, learns_by: Sequence[float], far: float, blind: float
-) -> list[Row]:
+) -> list[TrialRecord]:
     """Turns without the camera, by touch and by prediction; then as far as the grasp goes, predicted."""
     bench, made = _warmed(make, items[0], seed, learns_by), []
     dark = {"learn": False, "blind_deg": math.inf}
@@ -285,7 +270,8 @@ def foresight(
         start = bench.grasp(seed, _BLIND if options else _FAR)
         about = Trial(bench.name, "turn", bench.controller, seed, _FAR, blind if options else far)
         if start is None:
-            made.append(row(NotGrasped(**vars(about), message=bench.no_grasp), part=part))
+            missed = TrialRecord(**vars(about), reason=NOT_GRASPED, message=bench.no_grasp)
+            made.append(row(missed, part=part))
             continue
         reach, ends = (math.nan, "") if options else _reach(bench, far)
         record = bench.turn(about, start, **options)

@@ -23,15 +23,12 @@ import subprocess
 import sys
 import time
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas
-from dots import dot_chart
 from page import ROOT, Section, commit, page_text, provenance
 
-from torch_ekm.experiments.reporting.plots import save_figure
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 
 HERE = Path(__file__).parent
@@ -54,8 +51,6 @@ class Part:
     """It prints text, not Markdown."""
     pictures: tuple[str, ...] = ()
     """Figures of its report that the page shows."""
-    dots: dict[str, Any] = field(default_factory=dict)
-    """Arguments of :func:`dots.dot_chart`, which draws the tables, and a ``caption``."""
 
     @property
     def reports(self) -> bool:
@@ -130,18 +125,6 @@ def report_body(folder: Path, name: str, pictures: tuple[str, ...]) -> str:
     return report.markdown(level=2).strip()
 
 
-def drawn(body: str, given: dict[str, Any], folder: Path, name: str) -> str:
-    """The body of a page with a picture of its tables behind the answer, or first where it has none."""
-    caption = given["caption"]
-    figure = dot_chart(body, **{key: value for key, value in given.items() if key != "caption"})
-    save_figure(figure, folder, name)
-    (folder / f"{name}.png").unlink()
-    answer, _, rest = body.partition("\n\n")
-    picture = f"![{caption}]({folder.name}/{name}.svg)\n\n*{caption}*"
-    order = [picture, body] if answer.startswith(("|", "### ")) else [answer, picture, rest]
-    return "\n\n".join(order)
-
-
 def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
     """A page, and the pictures that it shows."""
     sections = []
@@ -153,8 +136,6 @@ def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
             body = f"```text\n{body}\n```"
         elif part.reports:
             body = report_body(folder / "report", name, part.pictures)
-        if part.dots:
-            body = drawn(body, part.dots, page.parent / name, f"dots_{k}")
         how = f"`{part.spoken()}`: commit {found['commit']}, {found['date']}, {found['minutes']} min."
         sections.append(Section(part.title, part.see, body, how))
         for picture in part.pictures:

@@ -19,11 +19,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
+from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.residual import (
     CalibrateNoise,
     DeepKernel,
@@ -273,20 +274,10 @@ def all_of(gp: SparseOnlineGP, m: int, shape: tuple[int, ...], n: int) -> Callab
 ENGINES = ("auto", "torch")
 
 
-class Table(NamedTuple):
-    """A heading, the columns, and rows of a name and numbers."""
-
-    title: str
-    columns: str
-    rows: list[tuple[str, *tuple[float, ...]]]
-
-    def markdown(self) -> str:
-        head = [f"### {self.title}", "", f"| {self.columns} |", "|---" * (self.columns.count("|") + 1) + "|"]
-        rows = [
-            [name, *("" if math.isnan(value) else f"{value:.1f}" for value in values)]
-            for name, *values in self.rows
-        ]
-        return "\n".join([*head, *(f"| {' | '.join(row)} |" for row in rows), ""])
+def table(title: str, columns: str, rows: list[Any]) -> Table:
+    """Names and numbers."""
+    name, *others = columns.split(" | ")
+    return Table(title, title, [name, *(Column(other, ".1f") for other in others)], rows)
 
 
 def against_c() -> Table:
@@ -305,7 +296,7 @@ def against_c() -> Table:
             ratios = np.median(rounds[:, 1:] / rounds[:, :1], axis=0)
             rows.append((f"{what}, {b} points, {m} outputs", *np.median(rounds, axis=0), *ratios))
     columns = "what | plain C [us] | compiled [us] | torch [us] | compiled : C | torch : C"
-    return Table("A sparse online GP beside plain C", columns, rows)
+    return table("A sparse online GP beside plain C", columns, rows)
 
 
 def of_fleets() -> Table:
@@ -324,7 +315,7 @@ def of_fleets() -> Table:
         default()
     mean = 1e6 * timed(default) / (64 * 256)
     rows.append(("default learner, update, mean", mean, math.nan))
-    return Table("Fleets of 256, per model", "what | compiled [us] | torch [us]", rows)
+    return table("Fleets of 256, per model", "what | compiled [us] | torch [us]", rows)
 
 
 def of_parts() -> Table:
@@ -341,7 +332,7 @@ def of_parts() -> Table:
             [call() for call in calls.values()]
         found = alternately(calls, rounds=3)
         rows.append((learned, *(us / 64 for us in found.values())))
-    return Table("Parts of a learner: update, mean", "what | compiled [us] | torch [us]", rows)
+    return table("Parts of a learner: update, mean", "what | compiled [us] | torch [us]", rows)
 
 
 def of_whole_learners() -> Table:
@@ -357,7 +348,7 @@ def of_whole_learners() -> Table:
         gp.update(*stream(2110, 6, seed=1))  # a memory is full then
     cost = [microseconds(functools.partial(gp.update, *stream(64, 6)), 2.0) / 64 for gp in deep]
     rows.append(("adaptation of the deep kernel", cost[1] - cost[0], math.nan))
-    return Table("Whole learners: update", "what | median [us] | slowest of 1000 [us]", rows)
+    return table("Whole learners: update", "what | median [us] | slowest of 1000 [us]", rows)
 
 
 def of_peers() -> Table:
@@ -369,14 +360,14 @@ def of_peers() -> Table:
             found = alternately({"peer": make(100, 6), "ours": samples(filled(100, 6), 6)}, rounds=3)
             rows.append((name, found["peer"], found["ours"], found["peer"] / found["ours"]))
     columns = "what, 100 points, 6 outputs | peer [us] | update and prediction here [us] | ratio"
-    return Table("Other libraries", columns, rows)
+    return table("Other libraries", columns, rows)
 
 
 def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
     for measure in (against_c, of_fleets, of_parts, of_whole_learners, of_peers):
-        print(measure().markdown(), flush=True)
+        print(Report("", "", [measure()]).markdown(level=2), flush=True)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,9 @@ Errors are rms of the second half over that of the model alone; rows appear as t
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,6 @@ from default_streams import (
     from_rest,
     jumping,
     noisy_side,
-    product_of_two,
     pure_noise,
     streams,
     there_and_back,
@@ -27,8 +28,13 @@ from default_streams import (
     with_outliers,
 )
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from dots import dot_chart
+
 from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.learner_comparison.prequential import Prequential, run_prequential
+from torch_ekm.experiments.reporting.plots import save_figure
+from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.residual import (
     DeepKernelSOGP,
     RandomFeatureRLS,
@@ -65,11 +71,9 @@ def left(make: Make, samples: Samples, begin: int) -> float:
     return ratio(run(make, samples).mean[begin:], samples.y[begin:])
 
 
-def table(n: int, seeds: Sequence[int], only: Sequence[str] = ()) -> None:
+def table(n: int, seeds: Sequence[int], only: Sequence[str] = ()) -> Table:
     """Each learner on each stream."""
-    print("| stream | " + " | ".join(LEARNERS) + " | default : best | coverage of 90 % |")
-    print("|---" * (len(LEARNERS) + 3) + "|")
-    drawn = streams(n, seeds)
+    drawn, rows = streams(n, seeds), []
     for name in only or drawn:
         errors, coverages = [], []
         for samples in drawn[name]:
@@ -78,9 +82,11 @@ def table(n: int, seeds: Sequence[int], only: Sequence[str] = ()) -> None:
             errors.append([ratio(r.mean[half:], samples.y[half:]) for r in runs])
             coverages.append(float(runs[0].coverage(half).mean()))
         mean = np.mean(errors, 0)
-        figures = " | ".join(f"{error:.3f}" for error in mean)
-        coverage = 100 * np.mean(coverages)
-        print(f"| {name} | {figures} | {mean[0] / mean.min():.2f} | {coverage:.0f} % |", flush=True)
+        rows.append([name, *mean.tolist(), float(mean[0] / mean.min()), float(np.mean(coverages))])
+        print(*rows[-1], file=sys.stderr, flush=True)
+    figures = [*(Column(name, ".3f") for name in LEARNERS), Column("default : best")]
+    columns = ["stream", *figures, Column("coverage of 90 % [%]", ".0f", percent=True)]
+    return Table("streams", "Error of each learner over that of the model alone", columns, rows)
 
 
 def jump(n: int, seed: int) -> float:
@@ -154,12 +160,16 @@ BARS: dict[str, tuple[Callable[[int, int], float], float]] = {
 }
 
 
-def bars(n: int, seeds: Sequence[int]) -> None:
+def bars(n: int, seeds: Sequence[int]) -> Table:
     """Mean and largest of the seeds."""
-    print("\n| test of the default learner | mean | largest | aim: at most |\n|---|---|---|---|")
+    rows = []
     for name, (measured, most) in BARS.items():
         found = [measured(n, seed) for seed in seeds]
-        print(f"| {name} | {np.mean(found):.3f} | {max(found):.3f} | {most:g} |", flush=True)
+        rows.append([name, float(np.mean(found)), max(found), most])
+        print(*rows[-1], file=sys.stderr, flush=True)
+    figures = Column("mean", ".3f"), Column("largest", ".3f"), Column("aim: at most", "g")
+    columns = ["test of the default learner", *figures]
+    return Table("bars", "What the default learner must bear", columns, rows)
 
 
 def _without_outliers(samples: Samples) -> Tensor:
@@ -169,38 +179,26 @@ def _without_outliers(samples: Samples) -> Tensor:
     return torch.where(hit, samples.clean + noise, samples.y)
 
 
-def overfitting(n: int, seeds: Sequence[int], capacity: int) -> None:
-    """The product of two of 32 inputs: the deep learner compared with the plain one."""
-    print(
-        f"\n| product of two of 32 inputs, {capacity} points | error of y | coverage of 90 % |\n|---|---|---|"
-    )
-    for name, make in (("SparseOnlineGP", SparseOnlineGP), ("DeepKernelSOGP", DeepKernelSOGP)):
-        found = []
-        for seed in seeds:
-            samples = product_of_two(n, seed)
-            r = run(make, samples, capacity=capacity)
-            found.append((ratio(r.mean[n // 2 :], samples.y[n // 2 :]), float(r.coverage(n // 2).mean())))
-        error, coverage = np.mean(found, 0)
-        print(f"| {name} | {error:.3f} | {100 * coverage:.0f} % |", flush=True)
-
-
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=parse_seeds, default=(0,), help="FIRST:END")
     parser.add_argument("--samples", type=int, default=2000)
     parser.add_argument("--stream", nargs="+", default=[], help="only these")
+    parser.add_argument("--out", type=Path, default=Path("default_learner_output"))
     parser.add_argument("--quick", action="store_true")
-    options = parser.parse_args(arguments)
+    given = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    if options.quick:
-        table(30, options.seeds[:1], ("smooth",))
-        bars(30, options.seeds[:1])
-        overfitting(30, options.seeds[:1], 15)
-        return
-    table(options.samples, options.seeds, options.stream)
-    if not options.stream:
-        bars(options.samples, options.seeds)
-        overfitting(7000, options.seeds, 300)
+    n, seeds, only = given.samples, given.seeds, given.stream
+    if given.quick:
+        n, seeds, only = 30, seeds[:1], ["smooth"]
+    tables = [table(n, seeds, only), bars(n, seeds)]
+    caption = "Errors of the learners on each stream, over those of the model alone."
+    figure = dot_chart(tables[:1], list(LEARNERS), "error / model alone", log=True)
+    shown = save_figure(figure, given.out, "streams", caption)
+    summary = f"rms errors of the second half, means over {len(seeds)} seeds."
+    report = Report("The default learner", summary, tables[::-1], [shown])
+    report.write(given.out)
+    print(report.markdown())
 
 
 if __name__ == "__main__":

@@ -54,15 +54,6 @@ def wide_and_noisy(n: int, seed: int) -> Samples:
     return Samples(x, f + torch.randn(n, 1, generator=g, dtype=torch.float64), f)
 
 
-def product_of_two(n: int, seed: int) -> Samples:
-    """32 inputs, the product of two of them, noise of half the signal."""
-    g = torch.Generator().manual_seed(seed)
-    x = math.sqrt(12.0) * (torch.rand(n, 32, generator=g, dtype=torch.float64) - 0.5)
-    f = x[:, :1] * x[:, 1:2]
-    f = f / f.std()
-    return Samples(x, f + 0.5 * torch.randn(n, 1, generator=g, dtype=torch.float64), f)
-
-
 def pure_noise(n: int, seed: int) -> Samples:
     """Nothing to learn."""
     g = torch.Generator().manual_seed(seed)

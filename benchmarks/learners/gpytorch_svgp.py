@@ -6,16 +6,17 @@ from typing import Any
 
 import gpytorch
 import torch
-from peer import Peer
 from torch import nn
+from torch.distributions import Normal
 
-from torch_ekm._checks import check_count
+from torch_ekm.residual.kinds import SingleLearner
+from torch_ekm.residual.report import UpdateReport
 from torch_ekm.typing import Tensor
 
 _RATE = 0.01  # of Adam
 
 
-class GPyTorchSVGP(Peer):
+class GPyTorchSVGP(SingleLearner):
     """GPyTorch's variational GP on inducing points, an Adam step on each sample and a replay.
 
     Independent outputs share inducing points that start as the first distinct samples. The bound's data
@@ -39,8 +40,7 @@ class GPyTorchSVGP(Peer):
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        self.inducing = check_count("inducing", inducing)
-        self.minibatch, self.memory = check_count("minibatch", minibatch), check_count("memory", memory)
+        self.inducing, self.minibatch, self.memory = inducing, minibatch, memory
         self.inputs = nn.Buffer(self._like.new_zeros(self.memory, self.in_features))
         self.targets = nn.Buffer(self._like.new_zeros(self.memory, self.out_features))
         self.reset()
@@ -96,15 +96,36 @@ class GPyTorchSVGP(Peer):
         model.eval()
         optimizer.load_state_dict(optimizer.state_dict())  # casts its averages
 
-    def _begin(self) -> None:
-        self._count = 0
-        self._peer = self._build()
-        self._settle()
+    def reset(self) -> None:
+        """A new model."""
+        super().reset()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            self._count, self._peer = 0, self._build()
+            self._settle()
 
-    def _law(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        model, likelihood, _ = self._peer
-        law = model(x)
-        return law.mean, law.stddev.square().clamp_min(1e-12), likelihood.task_noises
+    def _shaped(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of g."""
+        x = self.check_query(x)
+        law = self._peer[0](x.reshape(-1, self.in_features))
+        shape = (*x.shape[:-1], self.out_features)
+        return law.mean.reshape(shape), law.stddev.square().clamp_min(1e-12).reshape(shape)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The posterior mean."""
+        return self._shaped(x)[0]
+
+    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
+        """The posterior law, plus noise on request."""
+        with torch.no_grad():
+            mean, variance = self._shaped(x)
+            variance = variance + self._peer[1].task_noises if observation else variance
+        return Normal(mean, variance.sqrt(), validate_args=False)
+
+    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+        law = self.predict(x, observation=True)
+        self._learn(x, y)
+        return UpdateReport.of(((y - law.mean) / law.stddev).square().mean(-1), mask)
 
     def _apply(self, fn, recurse=True):
         super()._apply(fn, recurse)

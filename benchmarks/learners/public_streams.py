@@ -28,7 +28,12 @@ import numpy as np
 import torch
 from capymoa_regressor import CapyMOARegressor
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from dots import dot_chart
+
 from torch_ekm import default_learner
+from torch_ekm.experiments.reporting.plots import save_figure
+from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 from torch_ekm.interop import as_river
 from torch_ekm.residual import LearnHyperparameters, RobustWeight, SparseOnlineGP, Standardize
 from torch_ekm.typing import Array
@@ -72,6 +77,10 @@ PUBLISHED = (
     Published("Fried", "AdaPI", None, _INTERVALS, 0.963, 0.274),
     Published("Fried", "MVE", None, _INTERVALS, 0.974, 0.296),
 )
+_COLUMNS = (
+    "method", Column("MAE", ".4g"), Column("RMSE", ".4g"), Column("95 %: share [%]", ".1f", percent=True),
+    Column("width [%]", ".1f", percent=True), Column("time [ms]"), "source",
+)  # fmt: skip
 STREAMS = ("TrumpApproval", "ChickWeights", "Fried, first 1000", "Fried")
 
 
@@ -173,43 +182,30 @@ def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
         yield from capymoa_peers(x, y)
 
 
-def tables(rows: list[Row]) -> str:
-    """A table for each stream, ours next to what was published, as Markdown."""
-    lines = [
-        "Errors are those of each sample before it is learned; seed "
-        f"{SEED}. \"95 %\": share of samples in the interval, and its mean width over the range of y. "
-        '"again": the peer, run on the same machine. "ms": time of a sample, one thread.', "",
-    ]  # fmt: skip
+def tables(rows: list[Row]) -> list[Table]:
+    """A table for each stream, ours next to what was published."""
+    found = []
     for stream in STREAMS:
         mine = [row for row in rows if row.stream == stream]
-        if not mine:
-            continue
-        lines += [f"### {stream} ({mine[0].samples} samples)", ""]
-        lines += ["| | MAE | RMSE | 95 %: share | width | ms | source |", "|---|---|---|---|---|---|---|"]
+        cells: list[list[Cell]] = []
         for row in mine:
             name = f"**{row.method}**" if row.method in OURS else row.method
-            cells = [_cell(row.mae), _cell(row.rmse), _percent(row.coverage), _percent(row.width)]
-            lines.append(f"| {name} | {' | '.join(cells)} | {row.milliseconds:.2f} | here |")
+            cells.append([name, row.mae, row.rmse, row.coverage, row.width, row.milliseconds, "here"])
         for one in PUBLISHED:
-            if one.stream == stream:
-                cells = ["", _cell(one.rmse), _percent(one.coverage), _percent(one.width), ""]
-                lines.append(f"| {one.method}, published | {' | '.join(cells)} | {one.source} |")
-        lines.append("")
-    return "\n".join(lines)
-
-
-def _cell(value: float | None) -> str:
-    return "" if value is None or math.isnan(value) else f"{value:.3f}" if value < 10 else f"{value:.2f}"
-
-
-def _percent(value: float | None) -> str:
-    return "" if value is None else f"{100 * value:.1f} %"
+            if mine and one.stream == stream:
+                name = f"{one.method}, published"
+                cells.append([name, None, one.rmse, one.coverage, one.width, None, one.source])
+        if mine:
+            name, caption = stream.replace(",", "").replace(" ", "_"), f"{stream} ({mine[0].samples} samples)"
+            found.append(Table(name, caption, _COLUMNS, cells))
+    return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.add_argument("--out", type=Path, default=Path("public_streams_output"))
     parser.add_argument("--quick", action="store_true", help="the first 150 samples of each stream")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -218,7 +214,18 @@ def main() -> None:
     for row in measure(Path(data) if data else None, 150 if options.quick else None):
         print(row, file=sys.stderr, flush=True)
         rows.append(row)
-    print(tables(rows))
+    summary = (
+        f"Errors are those of each sample before it is learned; seed {SEED}. Share of samples in the 95 % "
+        'interval, and its mean width over the range of y. "again": the peer, run on the same machine. Time '
+        "of a sample, one thread."
+    )
+    caption = "RMSE of each sample before it is learned. Blue: this package; grey: other libraries."
+    found = tables(rows)
+    figure = dot_chart(found, ["RMSE"], "RMSE", shared=False)
+    shown = save_figure(figure, options.out, "public_streams", caption)
+    report = Report("Public streams", summary, found, [shown])
+    report.write(options.out)
+    print(report.markdown())
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 With its kinematic model, with and without learners. The recordings (Sintov et al., GitHub
 avishais/t42_autonomous_system) are read in place; docs/how_to/compare_on_your_data.md says how to save them
-as npz. Without ``--data`` a small synthetic set is made. Interrupted, it goes on where it stopped.
+as npz. Without ``--data`` a small synthetic set is made.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from recorded_hand.benchmark import count_jobs, predict_recorded_hand
+from recorded_hand.benchmark import predict_recorded_hand
 from recorded_hand.report import write_report
 
-from torch_ekm._terminal import print_report, progress
+from torch_ekm._terminal import print_report
 
 
 def main() -> None:
@@ -36,11 +36,9 @@ def main() -> None:
     )
     options = parser.parse_args()
     chosen = tuple(filter(None, map(str.strip, options.learners.split(","))))
-    with progress("predicting", count_jobs(options.data, len(chosen), quick=options.quick)) as advance:
-        result = predict_recorded_hand(
-            options.data, learners=chosen, folder=options.out / "runs", processes=options.jobs,
-            quick=options.quick, on_done=advance,
-        )  # fmt: skip
+    result = predict_recorded_hand(
+        options.data, learners=chosen, processes=options.jobs, quick=options.quick
+    )  # fmt: skip
     print_report(write_report(result, options.out), options.out, notes=True)
 
 

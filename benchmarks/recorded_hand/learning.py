@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
+from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.experiments.learners import learner_factory
-from torch_ekm.residual import MixtureResidual
 from torch_ekm.typing import Array
 
 from .nominal import Nominal, Samples, action_of
@@ -41,22 +41,18 @@ def learned_predictions(
     unit = _spread(samples[apart].motion - predicted[apart])
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # small matrices: more threads only wait for each other
-    found = {}
+    found = {name: predicted[name].copy() for name in order}
     try:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
             model = learner_factory(learner)(len(centre), 3)
             for name in order:
-                taken, alone = samples[name], predicted[name]
-                x = torch.from_numpy((_inputs(nominal, taken, states[name]) - centre) / scale)
-                left = torch.from_numpy((taken.motion - alone) / unit)
-                total = alone.copy()
-                for k in range(len(x) if limit is None else min(limit, len(x))):
-                    if isinstance(model, MixtureResidual) and (k == 0 or taken.path[k] != taken.path[k - 1]):
-                        model.new_sequence()
-                    total[k] += unit * model.predict(x[k], observation=True).mean.detach().numpy()
-                    model.update(x[k], left[k])
-                found[name] = total
+                taken = samples[name]
+                x = torch.from_numpy((_inputs(nominal, taken, states[name]) - centre) / scale)[:limit]
+                left = torch.from_numpy((taken.motion - predicted[name]) / unit)[:limit]
+                parts = np.unique(taken.path[:limit], return_counts=True)[1].tolist()
+                model.new_sequence()
+                found[name][:limit] += unit * run_prequential(model, x, left, parts).mean.numpy()
     finally:
         torch.set_num_threads(threads)
     return found

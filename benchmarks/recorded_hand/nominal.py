@@ -12,10 +12,10 @@ import torch
 from numpy.typing import NDArray
 
 from torch_ekm.description import HandDescription
-from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.play import Play
 from torch_ekm.model import KinematicModel
 from torch_ekm.model.calibration import Calibration, calibrate
+from torch_ekm.plant import Observation, PlantStatus, Trajectory
 from torch_ekm.typing import Array
 
 from .recordings import RecordedPath
@@ -164,47 +164,23 @@ def action_of(nominal: Nominal, samples: Samples) -> Array:
     return samples.transmitted if nominal.play else samples.delta_a
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """What :class:`~torch_ekm.model.calibration.Recording` asks of an observation."""
-
-    q: torch.Tensor
-    position: torch.Tensor
-    rotation: torch.Tensor
-    a: torch.Tensor
-    status: str
-    fingertip_force: None = None
-
-    @property
-    def state(self) -> GraspState:
-        return GraspState(self.q, self.position, self.rotation)
-
-
-@dataclass(frozen=True)
-class _Recorded:
-    observations: list[_Rest]
-
-
 def calibrate_hand(
     hand: HandDescription, paths: Sequence[RecordedPath], states: States, diameter: float
 ) -> Calibration:
     """Springs, moment arms and stiffnesses from the recording set apart, a cylinder of known diameter."""
     recordings, grasps = [], states.grasps()
     for number, path in enumerate(paths):
-        a = np.concatenate([np.zeros((1, 2)), np.cumsum(path.delta_a, axis=0)])
+        a = torch.from_numpy(np.concatenate([np.zeros((1, 2)), np.cumsum(path.delta_a, axis=0)]))
         own = np.flatnonzero((states.path == number) & (states.step % (EVERY * STRIDE) == 0))
-        recordings.append(
-            _Recorded(
-                [
-                    _Rest(
-                        grasps.q[k],
-                        grasps.position[k],
-                        grasps.rotation[k],
-                        torch.from_numpy(a[states.step[k]]),
-                        "held" if states.found[k] else "not_seen",
-                    )
-                    for k in own
-                ]
+        rests = [
+            Observation(
+                grasps.q[k],
+                a[states.step[k]],
+                grasps.position[k],
+                grasps.rotation[k],
+                status=PlantStatus.HELD if states.found[k] else PlantStatus.NOT_SEEN,
             )
-        )
+            for k in own
+        ]
+        recordings.append(Trajectory(observations=rests))
     return calibrate(KinematicModel(hand, cylinder(diameter), OPTIONS), recordings, CALIBRATED)

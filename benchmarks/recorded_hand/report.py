@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from dots import dot_chart
 
 from torch_ekm.experiments.reporting.plots import new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
@@ -28,9 +29,13 @@ def write_report(result: RecordedHandResult, folder: str | Path) -> Report:
     figure = save_figure(plot_paths(result, names), Path(folder), "paths", caption)
     horizons = sorted(HORIZONS, reverse=True)
     tables = [score_table(result, horizon, subset) for subset in SUBSETS for horizon in horizons]
-    configuration = {"apart": APART, "objects": result.reported, "calibration": result.calibration}
+    caption = (
+        "Error of the position over its motion, and 95 % intervals over objects; 1: as if nothing moved."
+    )
+    dots = save_figure(dot_chart(tables[:1], ["x", "y"], "error / motion"), Path(folder), "scores", caption)
+    configuration = {"apart": APART, "objects": result.reported, "calibration": str(result.calibration)}
     title = "Recorded motions of a Yale T42, predicted"
-    report = Report(title, summary(result), tables, [figure], configuration=configuration)
+    report = Report(title, summary(result), tables, [dots, figure], configuration=configuration)
     report.write(Path(folder))
     return report
 

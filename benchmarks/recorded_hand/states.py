@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -79,17 +79,6 @@ class States(NamedTuple):
             torsional_friction=torch.zeros_like(two),
             **fields,  # type: ignore[arg-type]  # by name, of the tensors alone
         )
-
-    def plain(self) -> dict[str, Any]:
-        """For JSON."""
-        parts = {name: np.asarray(getattr(self, name)).tolist() for name in self._fields[:-1]}
-        return {**parts, "contacts": {name: value.tolist() for name, value in self.contacts.items()}}
-
-    @classmethod
-    def of(cls, plain: dict[str, Any]) -> States:
-        """From :meth:`plain`."""
-        parts = {name: np.array(plain[name]) for name in cls._fields[:-1]}
-        return cls(**parts, contacts={name: np.array(value) for name, value in plain["contacts"].items()})
 
 
 def cylinder(diameter: float) -> ObjectDescription:

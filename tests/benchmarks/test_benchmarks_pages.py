@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import re
 import sys
 from pathlib import Path
@@ -16,6 +17,8 @@ from dots import dot_chart
 from page import Section, page_text
 
 from torch_ekm.experiments.reporting.plots import COLOURS
+from torch_ekm.experiments.reporting.report import Table
+from torch_ekm.experiments.reporting.statistics import Estimate
 
 
 def _plan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
@@ -137,36 +140,15 @@ def test_results_come_first_and_long_tables_are_files() -> None:
     assert len(files["part.csv"]) == 10
 
 
-TABLES = """Answer.
-
-### Errors: one
-
-| what | KM [deg] | E-KM [deg] | lost |
-|---|---|---|---|
-| plain | 1.00 [0.50, 2.00] | 0.10 | 0 |
-| other | - | 0.20 [0.1, 0.3] | 1 |
-| nothing | - | - | 2 |
-
-### Others
-
-| what | time |
-|---|---|
-| **ours** | 3 |
-"""
-
-
-def test_tables_are_drawn_with_their_intervals(tmp_path: Path) -> None:
-    given = {"columns": ["KM [deg]", "E-KM [deg]"], "label": "error [deg]", "caption": "All errors."}
-    body = write_pages.drawn(TABLES, given, tmp_path / "one", "dots_0")
-    assert body.startswith("Answer.\n\n![All errors.](one/dots_0.svg)\n\n*All errors.*\n\n### Errors: one")
-    assert [path.name for path in (tmp_path / "one").iterdir()] == ["dots_0.svg"]
-    (panel,) = dot_chart(TABLES, given["columns"], "error [deg]").axes
-    assert [text.get_text() for text in panel.get_yticklabels()] == ["plain", "other"]
-    dots = [(line.get_color(), *line.get_xdata()) for line in panel.lines]
-    km, ekm = COLOURS["KM"], COLOURS["E-KM"]
-    assert dots == [(km, 1.0), (km, 0.5, 2.0), (ekm, 0.1), (ekm, 0.2), (ekm, 0.1, 0.3)]
-    (single,) = dot_chart(TABLES, ["time"], "time", captions="Oth").axes
-    assert single.lines[0].get_color() != km  # ours, in bold
+def test_tables_are_drawn_with_their_intervals() -> None:
+    rows = [["plain", Estimate(1.0, 0.5, 2.0, 9), 0.1], ["other", None, math.nan], ["**ours**", 3.0, None]]
+    made = Table("errors", "Errors", ["what", "KM [deg]", "time"], rows)
+    (panel,) = dot_chart([made], ["KM [deg]"], "error [deg]").axes
+    assert [text.get_text() for text in panel.get_yticklabels()] == ["plain", "other", "ours"]
+    dots = [(line.get_color() == COLOURS["KM"], *line.get_xdata()) for line in panel.lines]
+    assert dots == [(True, 1.0), (True, 0.5, 2.0), (False, 3.0)]  # blue: ours, in bold
+    (both,) = dot_chart([made], ["KM [deg]", "time"], "").axes
+    assert len({line.get_color() for line in both.lines}) == 2
 
 
 def test_no_page_says_that_a_bar_is_met() -> None:

@@ -70,8 +70,3 @@ def test_plain_c_gives_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_allclose(reference.mean, ours.mean.numpy(), atol=1e-5)
     np.testing.assert_allclose(reference.jac, ours.mean_jacobian.numpy(), atol=1e-5)
     assert variance == pytest.approx(float(ours.variance[0]), abs=1e-5)
-
-
-def test_tables_of_learners_are_markdown() -> None:
-    table = bench_learners.Table("Times", "what | one [us] | two [us]", [("a", 1.25, float("nan"))])
-    assert table.markdown() == "### Times\n\n| what | one [us] | two [us] |\n|---|---|---|\n| a | 1.2 |  |\n"

@@ -6,7 +6,6 @@ import pytest
 import torch
 
 from torch_ekm.experiments.config import Setting
-from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.simulation import PRESETS
 
@@ -15,9 +14,8 @@ def test_object_is_turned_with_camera_and_hall_sensors() -> None:
     pytest.importorskip("cv2")
     bench = Bench(Setting(engine="mujoco", sensing=True), "box", "E-KM")
     record = bench.trial(0, 0, 6.0)
-    assert isinstance(record, TrialRecord)
     assert record.reason == "reached", record.message
-    assert record.true_error_deg < 0.5  # truth is only looked at afterwards
+    assert (record.true_error_deg or 9) < 0.5  # truth is only looked at afterwards
 
 
 def test_a_stuck_hall_channel_keeps_its_first_reading() -> None:

@@ -51,10 +51,6 @@ demo box --seeds 0:99999999 | at most 10000 seeds
 demo box --jobs 0 | --jobs
 demo box --out file.txt | cannot be written
 reproduce nothing | unknown experiment
-reproduce online --step 0 | more than 0 and at most 45 deg
-reproduce online --step -1 | more than 0 and at most 45 deg
-reproduce online --step nan | more than 0 and at most 45 deg
-reproduce online --step x | --step
 reproduce online --objects box | only generalize
 reproduce online --angles 5 | only generalize
 reproduce generalize --objects nothing | unknown object
@@ -83,7 +79,6 @@ compare --data s.csv --learners SOGP --out file.txt | cannot be written
 record file.txt | a log is a folder
 record log --object nothing | unknown object
 record log --controller bad | unknown controller
-record log --images --no-sensing | without sensing
 record log --angles '' | numbers separated by commas
 record log --seeds -3:2 | 0 <= FIRST < END
 show nothing | unknown hand or log

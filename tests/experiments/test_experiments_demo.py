@@ -6,14 +6,12 @@ import dataclasses
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.cli._app import parse_seeds
 from torch_ekm.control import Safety, StoppingRule
-from torch_ekm.exceptions import ParameterError, UnknownNameError
+from torch_ekm.exceptions import UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.jobs import read_result
 from torch_ekm.experiments.protocols.demo import Demo
@@ -41,8 +39,7 @@ def report(folder: Path) -> Report:
 @pytest.fixture(scope="module")
 def records(report: Report, folder: Path) -> list[TrialRecord]:
     kept = [read_result(path, path.stem) for path in sorted((folder / "runs").glob("*.json"))]
-    found = [TrialRecord.from_json(figures) for session in kept for figures in session]
-    return [record for record in found if isinstance(record, TrialRecord)]
+    return [TrialRecord.from_json(figures) for session in kept for figures in session]
 
 
 def test_every_target_is_approached_and_reached_by_the_enhanced_model(records: list[TrialRecord]) -> None:
@@ -90,7 +87,7 @@ def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Pat
     assert configuration["experiment"]["objects"] == ["box"]
     assert configuration["versions"]["torch"]
     by_angle = next(table for table in report.tables if table.name == "by_angle")
-    assert [row[0] for row in by_angle.rows] == [9.0, 14.0]
+    assert [row[0] for row in by_angle.rows] == ["9", "14", "all"]
 
 
 def test_a_finished_demo_is_not_run_again(
@@ -109,7 +106,6 @@ def test_the_demo_is_a_preset_of_generalize_and_repeats_itself(records: list[Tri
     generalize = dataclasses.replace(EXPERIMENT.protocol, angles_deg=(9.0,))
     (turn,) = generalize.session("box", "E-KM", 1)
     ours = next(r for r in records if (r.controller, r.seed, r.trial) == ("E-KM", 1, 0))
-    assert isinstance(turn, TrialRecord)
     assert turn.errors_deg == ours.errors_deg
     assert list(turn.poses) == list(ours.poses)
     assert len(turn.poses) == turn.steps + 1
@@ -127,17 +123,8 @@ def test_results_are_named_by_the_model_that_is_run() -> None:
 def test_wrong_names_list_the_right_ones() -> None:
     with pytest.raises(UnknownNameError, match="weighted_box"):
         Demo(objects=("spoon",))
-    with pytest.raises(UnknownNameError, match="icub_left"):
-        Demo(Setting(hand="icub"))
-    with pytest.raises(ParameterError, match="angles_deg"):
-        Demo(angles_deg=(200.0,))
     with pytest.raises(UnknownNameError, match="E-KM"):
         EXPERIMENT.protocol.session("box", "PID", 0)
-
-
-def test_small_version() -> None:
-    assert Demo(objects=("can",)).quick().angles_deg == (9, 13)
-    assert np.all(np.array(Demo().quick().angles_deg) == (9, 14))
 
 
 @pytest.mark.parametrize("command", [["--help"], ["demo", "--help"], ["hands"], ["objects"], ["version"]])
@@ -145,11 +132,3 @@ def test_command_line_explains_itself(command: list[str]) -> None:
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 0, result.output
     assert len(result.output) > 50
-
-
-def test_seeds_are_parsed() -> None:
-    assert parse_seeds("1000:1003") == (1000, 1001, 1002)
-    assert parse_seeds("7") == (7,)
-    for text in ("a", "3:1", "1:2:3", "", "2147483648"):
-        with pytest.raises(ParameterError, match=r"FIRST:END .* or one number below that"):
-            parse_seeds(text)

@@ -10,7 +10,6 @@ import torch
 
 from torch_ekm import residual
 from torch_ekm._recorded import describe, differences
-from torch_ekm.exceptions import UnknownNameError
 from torch_ekm.experiments.learners import COMPARED, LEARNERS, N_OUT, make_learner
 
 PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "choose_a_learner.md"
@@ -40,11 +39,6 @@ def motion_left(name: str) -> float:
 def test_one_learner_takes_up_a_dead_zone_and_the_default_leaves_it_to_the_servo_inverse() -> None:
     assert motion_left("rbf") < 0.35
     assert motion_left("action-linear") > 0.5  # a mean that is linear in the action cannot
-
-
-def test_unknown_learner_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(UnknownNameError, match="action-linear, rbf"):
-        make_learner("oracle", N_S, N_A, 20)
 
 
 @pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is not part of this installation")

@@ -157,15 +157,3 @@ def test_angles_of_a_user() -> None:
     assert planned.jobs.keys() != plan("generalize", (0,)).jobs.keys()  # no old results are taken up
     with pytest.raises(ParameterError, match="left out"):
         plan("online", (0,), angles_deg=(4.0,))
-    result = CliRunner().invoke(app, ["reproduce", "generalize", "--angles", "5:10"])
-    assert isinstance(result.exception, ParameterError)
-
-
-def test_command_line() -> None:
-    runner = CliRunner()
-    result = runner.invoke(app, ["reproduce", "--help"])
-    assert result.exit_code == 0, result.output
-    result = runner.invoke(app, ["reproduce", "offline"])
-    assert isinstance(result.exception, UnknownNameError)
-    result = runner.invoke(app, ["reproduce", "online", "--preset", "mild"])
-    assert isinstance(result.exception, UnknownNameError)

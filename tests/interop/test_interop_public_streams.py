@@ -33,10 +33,10 @@ def test_tables_hold_ours_beside_what_was_published() -> None:
         public_streams.Row("Fried", "default", 9, 1.0, 1.1, 2.0, 0.95, 0.17),
         public_streams.Row("TrumpApproval", "default", 9, 0.2, 0.34, 2.0),
     ]
-    text = public_streams.tables(rows)
-    assert "| **default** | 1.000 | 1.100 | 95.0 % | 17.0 % | 2.00 | here |" in text
-    assert "| kNN (best), published |  | 2.720 |" in text
-    assert "ChickWeights" not in text
+    trump, fried = public_streams.tables(rows)
+    assert fried.text()[0] == ["**default**", "1", "1.1", "95.0", "17.0", "2.00", "here"]
+    assert fried.text()[1][:3] == ["kNN (best), published", "-", "2.72"]
+    assert trump.caption == "TrumpApproval (9 samples)"
 
 
 def test_rivers_track_is_scored_by_river() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -61,10 +60,6 @@ def reproduce(
     ] = "action-linear",
     sensing: Sensing = True,
     angles: Annotated[str, Option(help="Turns [deg], e.g. 5,10; else shares of each end (generalize).")] = "",
-    step: Annotated[
-        float | None,
-        Option(help="Largest step without a plan [deg]; 2.5 if left out (less where a contact moves far)."),
-    ] = None,
 ) -> None:
     """Repeat the paper's experiments.
 
@@ -78,16 +73,10 @@ def reproduce(
 
     Time grows with the number of seeds and objects. With --quick: one or two minutes.
     """
-    from ..control import LimitingFunction
     from ..experiments.config import Setting
     from ..experiments.reproduce import plan
 
-    if step is not None and not 0 < step <= 45:
-        raise ParameterError("step", step, "more than 0 and at most 45 deg")
-    limiting = LimitingFunction() if step is None else LimitingFunction(step=math.radians(step))
-    setting = Setting(
-        hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing, limiting=limiting
-    )
+    setting = Setting(hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing)
     turns = parse_angles(angles) if angles else None
     chosen, things = parse_seeds(seeds), objects or None
     planned = plan(experiment, chosen, setting=setting, objects=things, angles_deg=turns, quick=quick)

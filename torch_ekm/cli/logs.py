@@ -40,7 +40,7 @@ def record(
     from ..experiments.protocols.record import record as run
 
     setting = Setting(hand=hand, preset=preset, engine=engine, sensing=sensing)
-    config = RecordConfig(setting, object, controller, parse_angles(angles), images)
+    config = RecordConfig(setting, object, controller, parse_angles(angles))
     chosen = parse_seeds(seeds)
     with progress("recording", len(chosen) * len(config.angles_deg)) as advance:
         made = run(config, chosen, log, on_trial=advance)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from .._checks import check_kind
+from .._recorded import describe
 from ..control import (
     DEFAULT_LIMITS,
     DEFAULT_TASKS,
@@ -27,7 +28,7 @@ from ..description.registry import file_digests
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import ENGINES, PlantConfig, PlantParameters, preset
-from .learners import DEFAULT_LEARNER, LEARNERS, learner_figures
+from .learners import DEFAULT_LEARNER, LEARNERS, make_learner
 
 #: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
 #: action: the increments accumulate on the set-point instead of the encoder, which learns nothing. "+S" is
@@ -129,7 +130,7 @@ class Setting:
             "plant_config": dataclasses.asdict(self.config),
             "model": dataclasses.asdict(self.model),
             "controller": [repr(part) for part in parts],
-            "learner": learner_figures(self.learner, self.capacity, **self.learner_options),
+            "learner": describe(make_learner(self.learner, 1, 1, self.capacity, **self.learner_options)),
         }
 
     def replace(self, **changes: Any) -> Setting:

@@ -8,7 +8,6 @@ from typing import Any
 import torch
 
 from .. import interop, residual
-from .._recorded import describe
 from ..enhanced.grasp_learner import ACTION_VARIANCE, NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
 from ..residual import ResidualLearner
@@ -161,8 +160,3 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
     """
     options = {"capacity": capacity, **_HAND_FIGURES.get(name, {}), **options}
     return learner_factory(name)(n_s + n_a, N_OUT, n_actions=n_a, **options)
-
-
-def learner_figures(name: str, capacity: int, **options: Any) -> dict[str, Any]:
-    """List what a learner is made with, defaults included, by one with one state and action."""
-    return describe(make_learner(name, 1, 1, capacity, **options))

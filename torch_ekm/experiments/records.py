@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -20,7 +20,10 @@ from ..typing import Float, Tensor
 
 _DEG = np.pi / 180
 _DISLOCATED = math.degrees(StoppingRule().off_limit)
-_MOVING = 0.5 * _DEG  # commands that ask for less say nothing about the shortfall of a step
+
+
+#: Why a trial ended in which no pinch held the object: nothing was measured.
+NOT_GRASPED = "not grasped"
 
 
 @dataclass(frozen=True)
@@ -38,50 +41,31 @@ class Trial:
     angle_deg: float
     """Rotation that was asked for [deg]."""
 
-    grasped: ClassVar[bool]
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain figures, from which :meth:`TrialRecord.from_json` makes the record again."""
-        return {"grasped": self.grasped, **dataclasses.asdict(self)}
-
-
-@dataclass(frozen=True)
-class NotGrasped(Trial):
-    """No pinch held the object: nothing was measured."""
-
-    message: str
-    """Why the last grasp failed."""
-
-    grasped: ClassVar[bool] = False
-    reason: ClassVar[str] = "not grasped"
-
 
 @dataclass(frozen=True)
 class TrialRecord(Trial):
-    """A manipulation of a grasped object; angles [deg]. Predictions are made before the learner trains on
-    the motion; those of the E-KM are empty where nothing learns."""
+    """A manipulation of an object; angles [deg]. Predictions are made before the learner trains on
+    the motion; those of the E-KM are empty where nothing learns. Without a grasp there are no figures."""
 
     reason: str
-    """Why it ended, a value of :class:`~torch_ekm.control.StopReason`."""
+    """Why it ended, a value of :class:`~torch_ekm.control.StopReason` or :data:`NOT_GRASPED`."""
     message: str
-    true_error_deg: float
+    true_error_deg: float | None = None
     """At the end, by the simulation's truth."""
-    errors_deg: tuple[float, ...]
+    errors_deg: tuple[float, ...] = ()
     """Before each motion and at the end, as measured."""
-    first_step_deg: float | None
+    first_step_deg: float | None = None
     """How far the first motion changed the error by more or less than it was to; None: no motion."""
-    step_error_deg: float | None
-    """The same, mean over the motions that ask for at least 0.5 deg; None: there was none."""
-    prediction_km_deg: tuple[float, ...]
+    prediction_km_deg: tuple[float, ...] = ()
     """One-step prediction error of the kinematic model for each motion, as measured."""
-    prediction_ekm_deg: tuple[float, ...]
+    prediction_ekm_deg: tuple[float, ...] = ()
     """The same of the E-KM."""
-    true_prediction_km_deg: tuple[float, ...]
+    true_prediction_km_deg: tuple[float, ...] = ()
     """Against the plant's truth, free of the camera's noise."""
-    true_prediction_ekm_deg: tuple[float, ...]
-    off_rotation_deg: float
+    true_prediction_ekm_deg: tuple[float, ...] = ()
+    off_rotation_deg: float = 0.0
     """Rotation off the focused axis at the end, as measured."""
-    seconds: tuple[float, ...]
+    seconds: tuple[float, ...] = ()
     """Decision and training of each motion, without the plant [s]."""
     poses: tuple[Any, ...] = ()
     """True joint angles [rad], position [m] and rotation before each motion and at the end, for pictures;
@@ -90,8 +74,13 @@ class TrialRecord(Trial):
     """Movements that turn; the others only grip."""
     simulated_s: float = 0.0
     """From the first reading to the last, by the plant's clock [s]."""
+    more: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Figures of a study; each is a column of the frame."""
 
-    grasped: ClassVar[bool] = True
+    @property
+    def grasped(self) -> bool:
+        """A pinch held the object."""
+        return self.reason != NOT_GRASPED
 
     @property
     def lost(self) -> bool:
@@ -104,7 +93,7 @@ class TrialRecord(Trial):
     @property
     def not_reached(self) -> bool:
         """The object is in the hand, but not where it was to be."""
-        return not self.lost and self.reason != StopReason.REACHED.value
+        return self.grasped and not self.lost and self.reason != StopReason.REACHED.value
 
     @property
     def steps(self) -> int:
@@ -112,20 +101,17 @@ class TrialRecord(Trial):
         return len(self.seconds)
 
     @classmethod
-    def from_json(cls, figures: Mapping[str, Any]) -> Self | NotGrasped:
-        """The record that :meth:`to_json` wrote.
+    def from_json(cls, figures: Mapping[str, Any]) -> Self:
+        """The record whose fields were kept as JSON.
 
         Raises:
             StateError: a figure is missing, or there is one that the record does not have.
         """
+        if wrong := {field.name for field in dataclasses.fields(cls)} ^ set(figures):
+            told = f"missing or unknown: {', '.join(sorted(wrong))}; remove results of another version"
+            raise StateError(f"the record has not the figures of {cls.__name__}: {told}")
         given: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in figures.items()}
-        kind = cls if given.pop("grasped", False) else NotGrasped
-        known = {field.name for field in dataclasses.fields(kind)}
-        if known != set(given):
-            wrong = ", ".join(sorted(known ^ set(given)))
-            told = f"missing or unknown: {wrong}; remove results of another version"
-            raise StateError(f"the record has not the figures of {kind.__name__}: {told}")
-        return kind(**given)
+        return cls(**given)
 
     @classmethod
     def of(
@@ -139,12 +125,11 @@ class TrialRecord(Trial):
         """
         steps, focus, measured = done.steps, done.focus, done.errors
         # how much of a step was missing: |e| should have fallen by what was asked for
-        short, moving = [], []
-        for step, (before, after) in zip(steps, pairwise(measured), strict=True):
-            asked = float(torch.linalg.vector_norm(step.decision.desired))
-            if step.decision.turns:
-                short.append(abs(after - (before - asked)))
-                moving += [short[-1]] if asked >= _MOVING else []
+        short = [
+            abs(after - (before - float(torch.linalg.vector_norm(step.decision.desired)))) / _DEG
+            for step, (before, after) in zip(steps, pairwise(measured), strict=True)
+            if step.decision.turns
+        ]
         truth = [true_state(seen) for seen in (*(step.before for step in steps), done.stop.final)]
         turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
 
@@ -164,22 +149,17 @@ class TrialRecord(Trial):
             message=done.stop.message,
             true_error_deg=focus.error(done.target, truth[-1]) / _DEG,
             errors_deg=tuple(error / _DEG for error in measured),
-            first_step_deg=short[0] / _DEG if short else None,
-            step_error_deg=float(np.mean(moving)) / _DEG if moving else None,
+            first_step_deg=short[0] if short else None,
             prediction_km_deg=errors("nominal"),
             prediction_ekm_deg=errors("predicted") if learns else (),
             true_prediction_km_deg=true_errors("nominal"),
             true_prediction_ekm_deg=true_errors("predicted") if learns else (),
             off_rotation_deg=off / _DEG,
             seconds=tuple(step.seconds for step in steps),
-            turning=sum(step.decision.turns for step in steps),
+            turning=len(short),
             simulated_s=done.stop.final.time - steps[0].before.time if steps else 0.0,
             poses=tuple([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in truth if poses),
         )
-
-
-#: What a session leaves.
-Record = TrialRecord | NotGrasped
 
 
 def prediction_error(

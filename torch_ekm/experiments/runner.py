@@ -31,7 +31,7 @@ from ..residual import ResidualLearner
 from ..simulation import DisturbedPlant, PlantChange, SimulatedHand, Tug
 from .config import Setting, object_name
 from .learners import DEFAULT_LEARNER, make_learner
-from .records import NotGrasped, Record, Trial, TrialRecord
+from .records import NOT_GRASPED, Trial, TrialRecord
 
 _DEG = math.pi / 180
 _TRIES = 4  # grasps drawn for one trial before it is given up
@@ -49,15 +49,12 @@ class Bench:
     Args:
         object: name, path or description.
         controller: one of ``CONTROLLERS``.
-        keep_images: with sensing, the camera's last image stays in ``info["raw"]["image"]``.
     """
 
     controllers: ClassVar[type[LookAndMoveController]] = LookAndMoveController
     loops: ClassVar[type[ClosedLoop]] = ClosedLoop
 
-    def __init__(
-        self, setting: Setting, object: str | ObjectDescription, controller: str, *, keep_images: bool = False
-    ) -> None:
+    def __init__(self, setting: Setting, object: str | ObjectDescription, controller: str) -> None:
         torch.set_num_threads(1)  # small matrices: more threads only wait for each other
         self.setting, self.controller = setting, controller
         config = setting.plant_config(controller)
@@ -66,7 +63,7 @@ class Bench:
         self.disturbed = DisturbedPlant(self.hand)
         self.plant: Plant = self.disturbed
         if setting.sensing:
-            self.plant = _sensed(self.disturbed, self.hand, setting, keep_images)
+            self.plant = _sensed(self.disturbed, self.hand, setting)
         else:
             self.plant = FramesAtRest(self.plant, setting.frames)
         inverse = controller == "KM+S" or (self.learns and setting.servo_inverse)
@@ -110,23 +107,22 @@ class Bench:
         self._failed += 1
         return None
 
-    def trial(self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any) -> Record:
+    def trial(
+        self, seed: int, trial: int, angle_deg: float, kind: str = "turn", **options: Any
+    ) -> TrialRecord:
         """Turn the object by ``angle_deg`` from a fresh grasp, with the options of :meth:`turn`."""
         start = self.grasp(seed, trial)
         about = Trial(self.name, kind, self.controller, seed, trial, angle_deg)
         if start is None:
-            return NotGrasped(**vars(about), message=self.no_grasp)
+            return TrialRecord(**vars(about), reason=NOT_GRASPED, message=self.no_grasp)
         return self.turn(about, start, **options)
 
-    def learn_hand(self, seed: int) -> list[Record]:
+    def learn_hand(self, seed: int) -> list[TrialRecord]:
         """Thirty motions with this object, in turns to and fro, for the knowledge of the hand."""
-        records: list[Record] = []
-        motions = 0
-        while motions < _MOTIONS and len(records) < _MOST_TURNS:
+        records: list[TrialRecord] = []
+        while sum(one.steps for one in records) < _MOTIONS and len(records) < _MOST_TURNS:
             k = len(records)
-            one = self.trial(seed, _FIRST_GRASP + k, _LEARNS_BY[k % len(_LEARNS_BY)], "first")
-            motions += one.steps if isinstance(one, TrialRecord) else 0
-            records.append(one)
+            records.append(self.trial(seed, _FIRST_GRASP + k, _LEARNS_BY[k % len(_LEARNS_BY)], "first"))
         return records
 
     def turn(
@@ -138,7 +134,6 @@ class Bench:
         events: Sequence[Tug | PlantChange] = (),
         blind_deg: float = 0.0,
         poses: bool = False,
-        focus: FocusedPose | None = None,
         **blind: Any,
     ) -> TrialRecord:
         """Turn the object that is held.
@@ -149,7 +144,6 @@ class Bench:
             events: what happens on the way; ``at`` counts this trial's commands from 0.
             blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
             poses: keep the true poses, for pictures.
-            focus: what of the turned pose is to be reached; None: the rotation about the hand's axis.
             blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
         now = self.disturbed.count
@@ -166,7 +160,11 @@ class Bench:
                 switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
                 **{"touch": False, **blind},
             )
-        self.last = _whole(self.closed_loop(plant, focus, learn=learn).run(target))
+        self.last = self.closed_loop(plant, learn=learn).run(target)
+        if (
+            self.last.stop.cause is not None
+        ):  # one that Ctrl-C or a failure of the plant cut short is no trial
+            raise self.last.stop.cause
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
     def close(self) -> None:
@@ -206,21 +204,14 @@ class Bench:
         )
 
 
-def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting, keep_images: bool) -> Plant:
+def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting) -> Plant:
     from ..sensing import ContactAligned  # OpenCV is needed only here
     from ..simulation import HallSensors, SensedPlant
 
     hand, stuck = simulated.hand, setting.parameters.stuck_joints
     hall = HallSensors(hand) if hand.hall_sensors else None
-    sensed = SensedPlant(plant, hand, simulated.object, hall=hall, keep_images=keep_images)
+    sensed = SensedPlant(plant, hand, simulated.object, hall=hall)
     if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
         hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
     rested = FramesAtRest(sensed, setting.frames)
     return rested if hall is None else ContactAligned(rested, hand, simulated.object)
-
-
-def _whole(done: Manipulation) -> Manipulation:
-    """One that Ctrl-C or a failure of the plant has cut short is no trial."""
-    if done.stop.cause is not None:
-        raise done.stop.cause
-    return done

@@ -44,10 +44,9 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
         DescriptionError: the file cannot be used; the message names line and column. The function raises
             it, too.
     """
-    content = read_file(path, "file of a table", _LARGEST)
-    decode(content, path)
-    before, given = _preamble(content)
-    tried = [partial(_records, path, content, before, one) for one in given or _SEPARATORS]
+    text = decode(read_file(path, "file of a table", _LARGEST), path)
+    before, given = _preamble(text)
+    tried = [partial(_records, path, text, before, one) for one in given or _SEPARATORS]
     records = max(tried, key=_fit)
     number, names = next(records(), (0, []))
     if not names:
@@ -61,24 +60,18 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
 
 def _fit(records: Records) -> tuple[bool, int]:
     """How well a separator does: whether the first lines have as many fields as the header, and how many."""
-    first: list[list[str]] = []
     try:
-        for _, row in itertools.islice(records(), _TRIED):
-            first.append(row)
+        first = [row for _, row in itertools.islice(records(), _TRIED)]
     except DescriptionError:
-        first.append([])
+        return False, 1
     names = _trimmed(first[0], len(first[0]) - 1) if first else []
-    same = all(len(_trimmed(row, len(names))) == len(names) for row in first)
-    return same and len(names) > 1, len(names)
+    return all(len(_trimmed(row, len(names))) == len(names) > 1 for row in first), len(names)
 
 
-def _preamble(content: bytes) -> tuple[int, str]:
+def _preamble(text: str) -> tuple[int, str]:
     """Lines before the header, and the separator that they say."""
-    separator, length = "", 0
-    for number, line in enumerate(_text(content)):
-        length += len(line)
-        if length > _LONGEST:
-            break
+    separator = ""
+    for number, line in enumerate(io.StringIO(text, newline="")):
         line = line.strip("\r\n")
         told = _EXCEL.fullmatch(line)
         if told is None and line.strip() and not line.startswith("#"):
@@ -87,31 +80,24 @@ def _preamble(content: bytes) -> tuple[int, str]:
     return 0, separator
 
 
-def _text(content: bytes) -> io.TextIOWrapper:
-    """A file of lines with their ends, as csv wants them."""
-    return io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", newline="")
-
-
-def _records(path: Path, content: bytes, before: int, separator: str) -> Iterator[tuple[int, list[str]]]:
+def _records(path: Path, text: str, before: int, separator: str) -> Iterator[tuple[int, list[str]]]:
     """Records that are not blank, with the number of their last line."""
     length = 0
 
     def lines() -> Iterator[str]:
         nonlocal length
-        for line in itertools.islice(_text(content), before, None):
+        for line in itertools.islice(io.StringIO(text, newline=""), before, None):
             length += len(line)
             if length > _LONGEST:
-                problem = "ends a megabyte of empty lines, or stands in a quote that does not close"
-                if len(line) > _LONGEST:
-                    problem = f"has more than {_LONGEST} characters"
+                problem = f"has more than {_LONGEST} characters, or stands in a quote that does not close"
                 raise DescriptionError(path, f"line {before + reader.line_num + 1} {problem}")
             yield line
 
     reader = csv.reader(lines(), delimiter=separator, skipinitialspace=True)
     try:
         for row in reader:
+            length = 0
             if len(row) > 1 or (row and row[0].strip()):
-                length = 0
                 yield before + reader.line_num, [field.strip() for field in row]
     except csv.Error as error:
         raise DescriptionError(path, f"line {before + reader.line_num}: {error}") from None

@@ -16,7 +16,7 @@ from ..._extras import require
 from ...exceptions import DescriptionError, EKMError, ParameterError, UnknownNameError
 from ...typing import Array
 from .own_recording import Columns, load_own
-from .stream import Stream, in_own_units, load_table
+from .stream import Stream, load_table
 
 LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
 
@@ -103,33 +103,6 @@ def load_t42() -> list[Stream]:
     ]
 
 
-def load_regression(name: str) -> tuple[Array, Array]:
-    """Inputs ``(n, d)`` and outputs ``(n, m)`` of a regression set in the order of its file, in its units.
-
-    Args:
-        name: ``sarcos`` (``sarcos/sarcos_inv_test.mat``, 21 inputs, 7 torques), ``kin40k``
-            (``uci/kin40k/data.csv.gz``, 8 inputs) or ``powerplant`` (``uci/power-plant.csv``, 4 inputs).
-
-    Raises:
-        UnknownNameError: there is no such set.
-        DescriptionError: its file is missing.
-    """
-    if name not in _REGRESSION:
-        raise UnknownNameError("regression set", name, _REGRESSION)
-    path, n_out, _ = _REGRESSION[name]
-    file = _need(path)
-    if file.suffix == ".mat":
-        values = next(v for k, v in require("scipy.io").loadmat(str(file)).items() if not k.startswith("__"))
-    else:
-        values = np.loadtxt(file, delimiter=",", skiprows=1 if file.suffix == ".csv" else 0)
-    return values[:, :-n_out], values[:, -n_out:]
-
-
-def _regression(name: str, limit: int | None) -> Stream:
-    x, y = load_regression(name)
-    return in_own_units(name, x, y, _REGRESSION[name][2], limit)
-
-
 def _t42(limit: int | None) -> Stream:
     objects = load_t42()
     share = None if limit is None else max(limit // len(objects), 1)  # of each object, its first samples
@@ -170,19 +143,21 @@ def _trial(path: Path) -> tuple[int, str]:
     return int(number), name
 
 
-def _series(name: str, limit: int | None) -> Stream:
-    path, lags, about = _SERIES[name]
-    series = np.loadtxt(_need(path))
-    x = np.lib.stride_tricks.sliding_window_view(series, lags)[:-1]
-    return in_own_units(name, x, series[lags:, None], f"{about}, next value; alone: the mean", limit)
+def _windows(values: Array, n: int) -> Array:
+    """The last n values at each time from the n-th on."""
+    return np.lib.stride_tricks.sliding_window_view(values, n)
 
 
-def _mimo(limit: int | None) -> Stream:
-    """Received signal from the last four sent ones, as in the Kernel Adaptive Filtering Toolbox."""
-    sent, received = np.loadtxt(_need("streams/mimotestbed8K.dat"), delimiter=",").T
-    x = np.lib.stride_tricks.sliding_window_view(sent, 4)
-    about = "a real 2x2 radio channel that changes (kafbox); alone: the mean"
-    return in_own_units("mimo", x, received[3:, None], about, limit)
+def _table(name: str, limit: int | None) -> Stream:
+    path, about, split = _TABLES[name]
+    file = _need(path)
+    if file.suffix == ".mat":
+        values = next(v for k, v in require("scipy.io").loadmat(str(file)).items() if not k.startswith("__"))
+    else:
+        comma = "," if "csv" in file.name or name == "mimo" else None
+        values = np.loadtxt(file, delimiter=comma, skiprows=1 if file.suffix == ".csv" else 0)
+    x, y = map(torch.from_numpy, map(np.array, split(values)))
+    return Stream(name, x, y, about=about).stream(limit, centre=True)
 
 
 def _need(path: str) -> Path:
@@ -195,22 +170,35 @@ def _need(path: str) -> Path:
     return full
 
 
-# name -> file, number of outputs (the last columns), and what it is
-_REGRESSION = {
-    "sarcos": ("sarcos/sarcos_inv_test.mat", 7, "seven torques of the SARCOS arm; alone: their mean"),
-    "kin40k": ("uci/kin40k/data.csv.gz", 1, "kinematics of an 8-link arm; alone: the mean"),
-    "powerplant": ("uci/power-plant.csv", 1, "a power plant's output; alone: the mean"),
-}
-# name -> file, number of values from which the next one is predicted, and what it is
-_SERIES = {
-    "lorenz": ("streams/lorenz.dat", 6, "Lorenz attractor"),
-    "mackey_glass": ("streams/mg30.dat", 10, "Mackey-Glass"),
-    "santafe": ("streams/santafe.dat", 10, "Santa Fe laser"),
-}
+def _last(n: int) -> Callable[[Array], tuple[Array, Array]]:
+    """The last n columns from the others."""
+    return lambda values: (values[:, :-n], values[:, -n:])
+
+
+def _next(n: int) -> Callable[[Array], tuple[Array, Array]]:
+    """The next value from the last n."""
+    return lambda values: (_windows(values, n)[:-1], values[n:, None])
+
+
+# name -> file, what it is, and how its values become inputs and outputs; series follow the Kernel Adaptive
+# Filtering Toolbox
+_TABLES: dict[str, tuple[str, str, Callable[[Array], tuple[Array, Array]]]] = {
+    "sarcos": (
+        "sarcos/sarcos_inv_test.mat", "seven torques of the SARCOS arm; alone: their mean", _last(7)
+    ),
+    "kin40k": ("uci/kin40k/data.csv.gz", "kinematics of an 8-link arm; alone: the mean", _last(1)),
+    "powerplant": ("uci/power-plant.csv", "a power plant's output; alone: the mean", _last(1)),
+    "lorenz": ("streams/lorenz.dat", "Lorenz attractor, next value; alone: the mean", _next(6)),
+    "mackey_glass": ("streams/mg30.dat", "Mackey-Glass, next value; alone: the mean", _next(10)),
+    "santafe": ("streams/santafe.dat", "Santa Fe laser, next value; alone: the mean", _next(10)),
+    "mimo": (
+        "streams/mimotestbed8K.dat",
+        "a real 2x2 radio channel that changes (kafbox); alone: the mean",
+        lambda values: (_windows(values[:, 0], 4), values[3:, 1:]),
+    ),
+}  # fmt: skip
 _READERS: dict[str, Callable[[int | None], Stream]] = {
     "t42": _t42,
     "icub_grasp": _icub_grasp,
-    "mimo": _mimo,
-    **{name: partial(_regression, name) for name in _REGRESSION},
-    **{name: partial(_series, name) for name in _SERIES},
+    **{name: partial(_table, name) for name in _TABLES},
 }

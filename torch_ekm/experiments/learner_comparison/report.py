@@ -107,13 +107,9 @@ def overview_table(comparison: Comparison) -> Table:
         figures = ((comparison.error(name, learner).mean, best[name] == learner) for name in names)
         cells = (f"{mean:.3f}{' *' if first else ''}" for mean, first in figures)
         rows.append([learner, *cells, float(rank)])
-    difference = comparison.critical_difference()
-    note = "* best of its column."
-    if np.isfinite(difference):
-        note += f" Mean ranks closer than {difference:.1f} are not distinguishable (Nemenyi, 5 %)."
     heads = [name + (", median" if comparison.measure(name) == "median" else "") for name in names]
     columns = ["learner", *heads, Column("mean rank", ".1f")]
-    return Table("overview", "rms error / that of the model alone", columns, rows, note)
+    return Table("overview", "rms error / that of the model alone", columns, rows, "* best.")
 
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:

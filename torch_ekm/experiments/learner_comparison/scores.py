@@ -108,19 +108,6 @@ class Comparison:
         table = [[self.error(stream.name, name).mean for name in self.learners] for stream in self.streams]
         return require("scipy.stats").rankdata(table, axis=1)
 
-    def critical_difference(self) -> float:
-        """Mean ranks that differ by less are not distinguishable (Nemenyi, 5 %; Demsar, JMLR 7, 2006)::
-
-            CD = q sqrt(k (k + 1) / (6 N))
-
-        for k learners on N streams; infinite for one stream.
-        """
-        k, n = len(self.learners), len(self.streams)
-        if n < 2 or k < 2:
-            return float("inf")
-        q = require("scipy.stats").studentized_range.ppf(0.95, k, np.inf) / np.sqrt(2)
-        return float(q * np.sqrt(k * (k + 1) / (6 * n)))
-
     def verdicts(self) -> list[str]:
         """For each stream: which learner is best and whether it helps, which others are not distinguishable
         from it, how far off the default is, on how many of how many rows, whether a few of them decide."""

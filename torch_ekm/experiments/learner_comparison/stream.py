@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..._extras import require
 from ...exceptions import DescriptionError, ParameterError, ShapeError
 from ...typing import Array, Float, Tensor
 from .table_file import find_columns, open_table
@@ -33,7 +32,7 @@ class Stream:
         available: samples of the file or recording, of which these are the first; 0: nobody counted.
         notes: what the user should look at, such as a clock among the inputs.
         outputs: names of the columns of y, and
-        unit: what 1 is in each, in the units of the file; empty: unknown.
+        unit: what 1 is in each, in the units of the file; empty: unknown, or they are those of the file.
 
     Raises:
         ShapeError: lengths do not fit.
@@ -57,7 +56,7 @@ class Stream:
         if self.segments and sum(self.segments) != n:
             raise ShapeError("segments", f"lengths that add up to {n}", self.segments)
         m, known = self.y.shape[1], (len(self.outputs), len(self.unit))
-        if known not in ((0, 0), (m, m)):
+        if known not in ((0, 0), (m, 0), (m, m)):
             raise ShapeError("outputs, unit", f"{m} of each", known)
 
     def __len__(self) -> int:
@@ -68,6 +67,31 @@ class Stream:
         """How many samples of how many, in words."""
         n, rows = len(self), max(self.available, len(self))
         return f"all {n} rows" if rows == n else f"the first {n} of {rows} rows"
+
+    def stream(self, limit: int | None = None, *, centre: bool = False) -> Stream:
+        """The same in units of its first tenth (20 to 200 samples), which is then not scored.
+
+        Nothing of what is scored is seen beforehand, but the unit of what rests in that tenth, which is that
+        of the whole stream. A constant input stays 0.
+
+        Args:
+            limit: only the first so many samples; None: all.
+            centre: y is centred, too; else it is only scaled, so that 0 is still what the model says.
+        """
+        x, y = (part[:limit].double().numpy() for part in (self.x, self.y))
+        warm_up = min(max(len(x) // 10, 20), 200)
+
+        def units(values: Array, centred: bool) -> tuple[Tensor, Array]:
+            start = values[:warm_up]
+            deviation, whole = start.std(0), values.std(0)
+            moves = deviation > np.maximum(_REST * whole, 1e-9 * np.abs(values).max(0))
+            deviation = np.where(moves, deviation, whole)
+            unit = np.where(deviation > 0, deviation, 1.0)
+            return torch.from_numpy((values - start.mean(0) if centred else values) / unit), unit
+
+        (inputs, _), (targets, unit) = units(x, True), units(y, centre)
+        unit = tuple(unit.tolist()) if self.outputs else ()
+        return replace(self, x=inputs, y=targets, warm_up=warm_up, available=len(self), unit=unit)
 
     def save(self, path: Path) -> Path:
         """Write the samples as CSV: columns ``x1..xd, y1..ym``."""
@@ -136,24 +160,15 @@ def load_table(
     parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
     if runs and 3 * len(parts) > len(x[:limit]):
         raise ParameterError("run", runs[0], "a column that is the same in all rows of a run")
-    notes = rows.about + (_other_order(values[1], values[2], outputs, model) if len(model) > 1 else "")
+    notes = rows.about
     if clocks := [name for name, column in zip(chosen, x.T, strict=True) if _is_clock(column, len(parts))]:
         notes += f" Like a clock or the number of a row, to be left out: {', '.join(clocks)}."
     if numbers := [name for name, column in zip(chosen, x.T, strict=True) if _is_number_of_run(column)]:
         notes += f" Like the number of a run: {', '.join(numbers)}; name it by --run (run=), or leave it out."
     names = [f"{one} - {other}" for one, other in zip(outputs, model, strict=True)] if model else outputs
-    stream = in_own_units(Path(path).stem, x, y, about, limit, outputs=names, centre_y=not zero_is_model)
-    return replace(stream, segments=tuple(parts) if runs else (), notes=notes)
-
-
-def _other_order(measured: Array, predicted: Array, outputs: list[str], model: list[str]) -> str:
-    """Says which predictions fit which outputs, where another order fits better."""
-    off = ((measured[:, :, None] - predicted[:, None]) ** 2).mean(0) / measured.var(0, keepdims=True).T
-    order = require("scipy.optimize").linear_sum_assignment(np.nan_to_num(off, nan=1e9, posinf=1e9))[1]
-    if off[range(len(order)), order].sum() > 0.5 * off.trace():
-        return ""
-    pairs = ", ".join(f"{model[k]} for {name}" for name, k in zip(outputs, order, strict=True))
-    return f" Predictions fit better in another order ({pairs}): name them in the order of the targets."
+    x, y = torch.from_numpy(x), torch.from_numpy(y)
+    stream = Stream(Path(path).stem, x, y, about=about, notes=notes, outputs=tuple(names))
+    return replace(stream.stream(limit, centre=not zero_is_model), segments=tuple(parts) if runs else ())
 
 
 def _is_clock(column: Array, n_runs: int) -> bool:
@@ -172,45 +187,3 @@ def _is_number_of_run(column: Array) -> bool:
 
 def _is_residual(name: str) -> bool:
     return name == "y" or (name[:1] == "y" and name[1:].isdigit())
-
-
-def in_own_units(
-    name: str,
-    x: Array,
-    y: Array,
-    about: str = "",
-    limit: int | None = None,
-    *,
-    outputs: Sequence[str] = (),
-    centre_y: bool = True,
-    ddof: int = 0,
-) -> Stream:
-    """Standardize by the first tenth of the stream (20 to 200 samples), which is then not scored.
-
-    Nothing of what is scored is seen beforehand, but the unit of what rests in that tenth, which is that of
-    the whole stream. A constant input stays 0.
-
-    Args:
-        limit: only the first so many samples.
-        outputs: names of the columns of y.
-        centre_y: False: y is only scaled, so that 0 is still what the model says.
-        ddof: of the standard deviations, as numpy has it.
-    """
-    available, x, y = len(x), x[:limit], y[:limit]
-    warm_up = min(max(len(x) // 10, 20), 200)
-
-    def units(values: Array, centre: bool = True) -> tuple[Tensor, Array]:
-        start = values[:warm_up]
-        deviation = start.std(0, ddof=ddof)
-        whole = values.std(0, ddof=ddof)
-        moves = deviation > np.maximum(_REST * whole, 1e-9 * np.abs(values).max(0))
-        deviation = np.where(moves, deviation, whole)
-        away = values - start.mean(0) if centre else values
-        unit = np.where(deviation > 0, deviation, 1.0)
-        return torch.from_numpy(away / unit), unit
-
-    (inputs, _), (targets, unit) = units(x), units(y, centre_y)
-    outputs, unit = tuple(outputs), tuple(unit.tolist()) if outputs else ()
-    return Stream(
-        name, inputs, targets, warm_up, about=about, available=available, outputs=outputs, unit=unit
-    )

@@ -15,8 +15,9 @@ from ...description import load_hand, load_object
 from ...exceptions import EKMError
 from ...rendering import make_scene, save_animation, save_picture
 from ..reporting.plots import plot_convergence, plot_prediction_error, save_figure
-from ..reporting.report import Cell, Column, FigureFile, Report, Table
+from ..reporting.report import FigureFile, Report
 from ..reporting.statistics import DataFrame
+from ..reporting.tables import group_table
 from ..reporting.trials import select
 from .generalize import Generalize
 
@@ -56,28 +57,11 @@ class Demo(Generalize):
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
         shown = ("stop_reasons", "controllers", "prediction")
-        report.tables = [self.angle_table(turns)] + [t for t in report.tables if t.name in shown]
+        by_angle = group_table(turns, "angle_deg", "each target")
+        report.tables = [by_angle] + [table for table in report.tables if table.name in shown]
         report.leading = 1
         report.figures = [*self._pictures(turns, folder), *self._motions(turns, folder), *report.figures]
         return report
-
-    def angle_table(self, turns: DataFrame) -> Table:
-        """Mean error, motions and lost objects for each target and controller."""
-        figures = {"error_deg": "mean", "motions": "mean", "lost": "sum"}
-        found = turns.groupby(["angle_deg", "controller"]).agg(figures)
-        columns: list[Column | str] = [Column("target [deg]", "g")]
-        for name in self.controllers:
-            columns += [f"{name}: error [deg]", Column(f"{name}: motions", ".1f"), f"{name}: lost"]
-        rows: list[list[Cell]] = []
-        for angle in map(float, self.angles_of(self.object)):
-            row: list[Cell] = [angle]
-            for name in self.controllers:
-                there = (angle, name) in found.index
-                error, motions, lost = found.loc[(angle, name)] if there else (None, None, None)
-                row += [error, motions, None if lost is None else int(lost)]
-            rows.append(row)
-        caption = "Mean steady-state error, motions and lost objects for each target"
-        return Table("by_angle", caption, columns, rows)
 
     def _motions(self, turns: DataFrame, folder: Path) -> list[FigureFile]:
         """How the prediction improves with each motion, and how the error falls in the longest turn."""

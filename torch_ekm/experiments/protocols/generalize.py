@@ -13,10 +13,10 @@ import numpy as np
 
 from ...exceptions import ParameterError
 from ..config import CONTROLLERS, Setting, digest, object_name
-from ..records import Record
+from ..records import TrialRecord
 from ..reporting import statistics as stats
 from ..reporting import tables
-from ..reporting.plots import crosses_caption, plot_steady_state_error, save_figure
+from ..reporting.plots import plot_steady_state_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
 from ..reporting.statistics import DataFrame
 from ..reporting.trials import select
@@ -107,7 +107,7 @@ class Generalize(Protocol):
             for name in self.controllers
         }
 
-    def session(self, object: str, controller: str, seed: int) -> list[Record]:
+    def session(self, object: str, controller: str, seed: int) -> list[TrialRecord]:
         """Warm-up (E-KM only), then all angles, with one object and one seed."""
         bench = Bench(self.setting.hardware_instance(seed), object, controller)
         turn = partial(bench.trial, seed)
@@ -124,21 +124,24 @@ class Generalize(Protocol):
         turns, figures = select(trials, kind="turn"), []
         if len(turns):
             caption = "Steady-state error with each object for each target: every turn, and the mean (the "
-            caption += f"paper's Fig. 6).{crosses_caption(turns)}"
+            caption += "paper's Fig. 6). Crosses at the upper edge: errors above."
             figures = [save_figure(plot_steady_state_error(turns), folder, "steady_state_error", caption)]
         significance = significance_table(trials)
         shown = [
             paper_table(trials),
             significance,
             tables.reason_table(trials),
-            object_table(trials),
-            ends_table(trials),
+            tables.group_table(trials, "object", "each object"),
             tables.controller_table(trials),
             tables.prediction_table(trials),
         ]
         shown = [table for table in shown if table.rows]
         names = ", ".join(object_name(item) for item in self.objects)
-        summary = f"{tables.verdict(trials, seeds)} Objects: {names}.{tables.warmed_up(self.warm_up)}"
+        summary = f"{tables.verdict(trials, seeds)} Objects: {names}."
+        if self.warm_up:
+            summary += (
+                f" Turns of the E-KM with each object and seed before those that count: {self.warm_up}."
+            )
         if significance.rows:
             won, *_, until = (row[-1] for row in significance.rows)
             summary += f" Cells that the E-KM wins on one hand: {won}; significant after {until} turns."
@@ -166,21 +169,16 @@ def paper_table(trials: DataFrame) -> Table:
     return Table("paper", "The paper's Table II, and the same here", columns, rows, note)
 
 
-def cell_errors(trials: DataFrame) -> tuple[DataFrame, DataFrame]:
-    """Errors of E-KM and KM [deg], a row for each cell (object and target), a column for each hand."""
-    turns, cells = select(trials, kind="turn"), ["object", "trial", "angle_deg"]
-    ekm, km = (
-        select(turns, controller=name).pivot_table("error_deg", cells, "seed", sort=False)
-        for name in ("E-KM", "KM")
-    )
-    return ekm.align(km, join="inner")
-
-
 def significance_table(trials: DataFrame) -> Table:
     """Cells that the E-KM wins on a hand, and the tests of its errors, of the paper's objects if any."""
     both = trials[trials["object"].isin(list(TABLE_II))]
     chosen, rows = both if len(both) else trials, []
-    ekm, km = cell_errors(chosen)
+    turns, cells = select(chosen, kind="turn"), ["object", "trial", "angle_deg"]
+    ekm, km = (  # a row for each cell, a column for each hand
+        select(turns, controller=name).pivot_table("error_deg", cells, "seed", sort=False)
+        for name in ("E-KM", "KM")
+    )
+    ekm, km = ekm.align(km, join="inner")
     seeds = (ekm - km).dropna(axis=1).columns
     if len(seeds) and len(ekm) > 1:
         hands = [(ekm[seed].to_numpy(), km[seed].to_numpy()) for seed in seeds]
@@ -200,36 +198,3 @@ def significance_table(trials: DataFrame) -> Table:
         "the first k cells, object by object, show no advantage at 5 %."
     )
     return Table("significance", "Cells won, and p-values", ["figure", "paper", "here"], rows, note)
-
-
-def object_table(trials: DataFrame) -> Table:
-    """Steady-state error of each object, paired (the paper's Table II)."""
-    rows: list[list[Cell]] = []
-    for item, chosen in tables.by_object(trials).items():
-        by = tables.by_controller(chosen)
-        if not {"KM", "E-KM"} <= set(by):
-            continue
-        pair = stats.paired_means(by["E-KM"], by["KM"], "error_deg")
-        errors = (stats.estimate(by[name], "error_deg") if name in by else None for name in CONTROLLERS)
-        rows.append([item, *errors, *tables.ratio_and_p(*pair, chosen["seed"].nunique())])
-    columns = [
-        "object", *(f"{name} [deg]" for name in CONTROLLERS), Column("E-KM:KM [%]", ".0f", percent=True),
-        Column("p paired", ".1g"),
-    ]  # fmt: skip
-    note = (
-        "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
-        "pairs of object and seed."
-    )
-    return Table("by_object", "Steady-state error of each object", columns, rows, note)
-
-
-def ends_table(trials: DataFrame) -> Table:
-    """Lost objects and turns that did not reach the target, for each object and controller."""
-    names = list(tables.by_controller(trials))
-    rows: list[list[Cell]] = []
-    for item, chosen in tables.by_object(trials).items():
-        turns = select(chosen, kind="turn").groupby("controller")[["lost", "not_reached"]]
-        ended = turns.sum().astype(int).reindex(names, fill_value=0)
-        rows.append([item, *(f"{lost}, {missed}" for lost, missed in ended.to_numpy())])
-    columns = ["object", *(f"{name} lost, not reached" for name in names)]
-    return Table("ends", "Objects lost, and turns that did not reach the target", columns, rows)

@@ -13,7 +13,7 @@ import numpy as np
 from ...exceptions import ParameterError
 from ...simulation import PlantChange, Tug
 from ..config import CONTROLLERS, Setting, digest, object_name
-from ..records import Record
+from ..records import TrialRecord
 from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
@@ -79,7 +79,7 @@ class Online(Protocol):
         stem = f"online_{digest(self.setting, (self.object,), alone)}"
         return {f"{stem}_{name}_{seed}": (name, seed) for seed in seeds for name in self.controllers}
 
-    def session(self, controller: str, seed: int) -> list[Record]:
+    def session(self, controller: str, seed: int) -> list[TrialRecord]:
         """All trials of one seed, in order."""
         angles = np.random.default_rng(seed).uniform(*self.angle_range_deg, size=self.trials)
         bench = Bench(self.setting.hardware_instance(seed), self.object, controller)

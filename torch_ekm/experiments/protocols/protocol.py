@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from ..config import Setting
-from ..records import Record
+from ..records import TrialRecord
 from ..reporting.report import Report
 from ..reporting.statistics import DataFrame
 
@@ -31,7 +31,7 @@ class Protocol(ABC):
         """The jobs of these seeds: name -> arguments of :meth:`session`."""
 
     @abstractmethod
-    def session(self, *arguments: Any) -> Sequence[Record]:
+    def session(self, *arguments: Any) -> Sequence[TrialRecord]:
         """Trials that belong together, one after the other; the results of different sessions are
         independent."""
 
@@ -45,4 +45,4 @@ class Protocol(ABC):
 
     def run(self, *arguments: Any) -> list[dict[str, Any]]:
         """Run :meth:`session`; its records in terms that JSON can keep."""
-        return [record.to_json() for record in self.session(*arguments)]
+        return [vars(record) for record in self.session(*arguments)]

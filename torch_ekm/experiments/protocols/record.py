@@ -22,22 +22,18 @@ class RecordConfig:
 
     Raises:
         UnknownNameError: no such controller; the message lists them.
-        ParameterError: no angle, one that is no rotation, or images without sensing.
+        ParameterError: no angle, or one that is no rotation.
     """
 
     setting: Setting = field(default_factory=Setting)
     object: str = "box"
     controller: str = "KM"
     angles_deg: tuple[float, ...] = (10.0, 20.0)
-    images: bool = False
-    """Keep the camera's images too, 0.2 MB each."""
 
     def __post_init__(self) -> None:
         self.setting.plant_config(self.controller)
         if not self.angles_deg or not all(0 < abs(angle) < 180 for angle in self.angles_deg):
             raise ParameterError("angles_deg", self.angles_deg, "angles between 0 and 180 deg")
-        if self.images and not self.setting.sensing:
-            raise ParameterError("images", True, "False without sensing: there is no camera")
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -75,7 +71,7 @@ def record(
             missing = log.missing(trials)
             bench = None
             if missing:
-                bench = Bench(config.setting, config.object, config.controller, keep_images=config.images)
+                bench = Bench(config.setting, config.object, config.controller)
                 bench.plant = RecordingPlant(bench.plant)
             for trial, angle in zip(trials, config.angles_deg, strict=True):
                 if bench is not None and (trial in missing or bench.learns):
@@ -90,9 +86,10 @@ def record(
 def _turn(bench: Bench, log: TrialLog, seed: int, trial: int, angle: float) -> None:
     assert isinstance(bench.plant, RecordingPlant)
     try:
-        outcome = bench.trial(seed, trial, angle).to_json()
+        outcome = dict(vars(bench.trial(seed, trial, angle)))
     except EKMError as error:  # kept, or the run would stop at this trial each time
         outcome = {"reason": type(error).__name__, "message": str(error)}
-    outcome.pop("seconds", None)  # of the wall: equal runs are to give equal logs
+    for name in ("seconds", "more"):  # seconds of the wall: equal runs are to give equal logs
+        outcome.pop(name, None)
     if trial not in log:
         log.write(trial, bench.plant.trajectory, outcome)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -101,21 +101,30 @@ def plot_learning_test(ekm_deg: Array, km_deg: Array) -> Figure:
 
 def plot_steady_state_error(turns: DataFrame) -> Figure:
     """Steady-state error of each controller for each object and target (the paper's Fig. 6): every run and
-    the mean.
-
-    A few turns at many times the error of all others are crosses at the upper edge; a mean that they carry
-    beyond it is written there.
+    the mean. A few turns at many times the error of all others are crosses at the upper edge.
 
     Args:
         turns: of :func:`~torch_ekm.experiments.reporting.trials.trial_frame`.
     """
-    objects = list(turns.groupby("object", sort=False))
+    objects, controllers = list(turns.groupby("object", sort=False)), list(turns["controller"].unique())
     columns = min(len(objects), 3)
     rows = -(-len(objects) // columns)
     figure, panels = new_figure(max(6.5, 3.6 * columns), 3.4 if rows == 1 else 2.6 * rows, columns, rows)
-    for axis, (name, mine) in zip(panels, objects, strict=False):
-        _draw_errors(axis, mine, list(turns["controller"].unique()))
-        axis.set_title(str(name).replace("_", " "), loc="left", fontsize=10)
+    width = 0.8 / len(controllers)
+    for axis, (item, mine) in zip(panels, objects, strict=False):
+        top, targets = 1.3 * float(mine["error_deg"].quantile(0.95)), sorted(mine["angle_deg"].unique())
+        top = top if mine["error_deg"].max() > 2 * top else np.inf
+        for (name, target), errors in mine.groupby(["controller", "angle_deg"], sort=False)["error_deg"]:
+            j, values = controllers.index(name), errors.to_numpy()
+            colour, marker = COLOURS.get(name, f"C{j}"), _MARKERS.get(name, "o")
+            x = targets.index(target) + (j - (len(controllers) - 1) / 2) * width
+            axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=name)
+            at, inside = x + np.linspace(-0.3, 0.3, len(values)) * width, values <= top
+            axis.plot(at[inside], values[inside], marker, color=colour, markersize=2)
+            axis.plot(at[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
+        axis.set_xticks(range(len(targets)), [f"{target:g}" for target in targets])
+        axis.set(xlabel="target [deg]", ylim=(0, top if np.isfinite(top) else None))
+        axis.set_title(str(item).replace("_", " "), loc="left", fontsize=10)
     for axis in panels[len(objects) :]:
         axis.set_axis_off()
     for axis in panels[: len(objects) : columns]:
@@ -123,38 +132,6 @@ def plot_steady_state_error(turns: DataFrame) -> Figure:
     drawn = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
     figure.legend(drawn.values(), drawn.keys(), frameon=False, loc="outside upper right", ncols=4)
     return figure
-
-
-def _draw_errors(axis: Any, turns: DataFrame, controllers: list[str]) -> None:
-    """Draw the errors of one object."""
-    top, targets = _top(turns), sorted(turns["angle_deg"].unique())
-    width = 0.8 / len(controllers)
-    for (name, target), errors in turns.groupby(["controller", "angle_deg"], sort=False)["error_deg"]:
-        j, values = controllers.index(name), errors.to_numpy()
-        colour, marker = COLOURS.get(name, f"C{j}"), _MARKERS.get(name, "o")
-        x = targets.index(target) + (j - (len(controllers) - 1) / 2) * width
-        axis.bar(x, values.mean(), width * 0.9, color=colour, alpha=0.45, label=name)
-        at = x + (np.linspace(-0.3, 0.3, len(values)) * width if len(values) > 1 else np.zeros(1))
-        inside = values <= top
-        axis.plot(at[inside], values[inside], marker, color=colour, markersize=2)
-        axis.plot(at[~inside], [0.97 * top] * int((~inside).sum()), "x", color=colour)
-        if values.mean() > top:
-            note = {"xytext": (-9, 0), "textcoords": "offset points", "fontsize": 8, "ha": "right"}
-            axis.annotate(f"{name}: mean {values.mean():.1f}", (x, (0.9 - 0.08 * j) * top), **note)
-    axis.set_xticks(range(len(targets)), [f"{target:g}" for target in targets])
-    axis.set(xlabel="target [deg]", ylim=(0, top if np.isfinite(top) else None))
-
-
-def _top(turns: DataFrame) -> float:
-    """Upper edge of the errors [deg]; infinite: all of them are shown."""
-    top = 1.3 * float(turns["error_deg"].quantile(0.95))
-    return top if turns["error_deg"].max() > 2 * top else np.inf
-
-
-def crosses_caption(turns: DataFrame) -> str:
-    """Say what the crosses in :func:`plot_steady_state_error` are; "": there are none."""
-    beyond = sum(int((mine["error_deg"] > _top(mine)).sum()) for _, mine in turns.groupby("object"))
-    return f" Crosses at the upper edge: {beyond} turn{'' if beyond == 1 else 's'} above." if beyond else ""
 
 
 def plot_convergence(turns: DataFrame, target: str = "") -> Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from ..._extras import require
 from ...control import StopReason
 from ...typing import Array
 from ..config import CONTROLLERS, FIRST_REPORTED
-from ..records import NotGrasped
+from ..records import NOT_GRASPED
 from . import statistics as stats
 from .report import Cell, Column, Table
 from .statistics import LEAST_SEEDS, DataFrame, Estimate
@@ -36,7 +36,7 @@ _MEANINGS = {
     StopReason.OUT_OF_REACH.value: "declined before anything moved",
     StopReason.OBJECT_LOST.value: "the object was dropped, or turned too far off the axis",
     StopReason.FORCE_CEILING.value: "a fingertip pressed harder than the guard allows",
-    NotGrasped.reason: "no pinch held the object",
+    NOT_GRASPED: "no pinch held the object",
 }
 
 
@@ -77,12 +77,43 @@ def controller_table(trials: DataFrame) -> Table:
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
 
 
+def group_table(trials: DataFrame, by: str, what: str) -> Table:
+    """Steady-state errors and ends of the turns by the entries of a column, the E-KM's paired with the KM's.
+
+    Args:
+        by: "object" (the paper's Table II), "angle_deg".
+        what: the groups in words.
+    """
+    names, rows = list(by_controller(trials)), []
+    turns = trials[trials["kind"] == "turn"]
+    groups = {
+        f"{key:g}" if isinstance(key, float) else str(key): mine
+        for key, mine in turns.groupby(by, sort=False)
+    }
+    for key, mine in {**groups, "all": turns}.items():
+        found = by_controller(mine)
+        errors = [stats.estimate(found[name], "error_deg") if name in found else None for name in names]
+        ends = (f"{name} {of['lost'].sum()}, {of['not_reached'].sum()}" for name, of in found.items())
+        compared = ratio_and_p(*paired(mine, "E-KM", "KM", "error_deg"), mine["seed"].nunique())
+        rows.append([key, *errors, *compared, "; ".join(ends)])
+    columns = [
+        by.replace("_deg", " [deg]"), *(f"{name} [deg]" for name in names),
+        Column("E-KM:KM [%]", ".0f", percent=True), Column("p paired", ".1g"),
+        "lost, not reached",
+    ]  # fmt: skip
+    note = (
+        "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
+        "pairs of object and seed."
+    )
+    return Table(f"by_{by.removesuffix('_deg')}", f"Steady-state error of {what}", columns, rows, note)
+
+
 def reason_table(trials: DataFrame) -> Table:
     """Why the turns of each controller ended, and how far from the target."""
     turns = trials[trials["kind"] == "turn"]
     names = [name for name in CONTROLLERS if (turns["controller"] == name).any()]
     rows: list[list[Cell]] = []
-    for reason in [*(reason.value for reason in StopReason), NotGrasped.reason]:
+    for reason in [*(reason.value for reason in StopReason), NOT_GRASPED]:
         mine = turns[turns["reason"] == reason].groupby("controller")["survivor_error_deg"]
         if not len(mine):
             continue
@@ -165,7 +196,7 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
             f"{name} {turns[name]['lost'].sum()} and {turns[name]['not_reached'].sum()} of {len(turns[name])}"
             for name in order
         ]
-        parts.append(f"The {', '.join([first, *ends[1:]])}, on {_counted(len(seeds), 'seed')}.")
+        parts.append(f"The {', '.join([first, *ends[1:]])}, on {len(seeds)} seed{'s' * (len(seeds) > 1)}.")
         parts.append(f"Objects lost, and turns that did not reach the target: {', '.join(failed)}.")
         if 2 * (turns[order[0]]["reason"] == _REACHED).sum() < len(turns[order[0]]):
             parts.append(f"The {order[0]}: {why(turns[order[0]])}")
@@ -178,7 +209,9 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
         ratios = [f"{name} {100 * ratio:.0f} %" for name, ratio in found.items() if ratio is not None]
         if ratios:
             parts.append(f"Error of the E-KM over that of {', '.join(ratios)} (paired).")
-    parts += [f"{name} was never grasped ({why})." for name, why in _never_grasped(trials).items()]
+    for name, mine in trials[trials["kind"] == "turn"].groupby("object", sort=False):
+        if not mine["grasped"].any():
+            parts.append(f"{name} was never grasped ({mine['message'].iloc[-1]}).")
     return f"{' '.join(parts) or 'Nothing to compare.'} {which_seeds(seeds)}"
 
 
@@ -187,22 +220,6 @@ def why(turns: DataFrame) -> str:
     reasons = turns["reason"].value_counts()
     said = turns.loc[turns["reason"] == reasons.index[0], "message"].mode()[0]
     return f"{reasons.iloc[0]} of {len(turns)} turns ended with '{reasons.index[0]}'{said and f': {said}'}."
-
-
-def warmed_up(turns: int) -> str:
-    """Say what the E-KM does before it is measured."""
-    before = f" The E-KM makes {_counted(turns, 'turn')} with each object and seed before those that count."
-    return before if turns else ""
-
-
-def _counted(n: int, what: str) -> str:
-    return f"{n} {what}{'' if n == 1 else 's'}"
-
-
-def _never_grasped(trials: DataFrame) -> Mapping[str, str]:
-    """Objects that no turn could hold, with the reason of the last try."""
-    turns = trials[trials["kind"] == "turn"].groupby("object", sort=False)
-    return {str(name): mine["message"].iloc[-1] for name, mine in turns if not mine["grasped"].any()}
 
 
 def which_seeds(seeds: Sequence[int]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -10,18 +9,13 @@ from typing import Any
 import numpy as np
 
 from ..._extras import require
-from ..records import Record, TrialRecord
+from ..records import TrialRecord
 from .statistics import DataFrame
 
-#: What :func:`trial_frame` adds to the figures of a record; NaN where nothing was grasped.
-_ADDED = (
-    "error_deg", "survivor_error_deg", "survivor_off_deg", "motions",
-    "prediction_km", "prediction_ekm", "true_prediction_km", "true_prediction_ekm",
-)  # fmt: skip
-_COLUMNS = ("job", "grasped", *(field.name for field in dataclasses.fields(TrialRecord)), *_ADDED)
+_PREDICTIONS = ("prediction_km", "prediction_ekm", "true_prediction_km", "true_prediction_ekm")
 
 
-def trial_frame(results: Mapping[str, Iterable[Record]]) -> DataFrame:
+def trial_frame(results: Mapping[str, Iterable[TrialRecord]]) -> DataFrame:
     """The trials of all jobs, one row each.
 
     Columns are the figures of the record and
@@ -31,7 +25,6 @@ def trial_frame(results: Mapping[str, Iterable[Record]]) -> DataFrame:
     lost, not_reached       as in :class:`~torch_ekm.experiments.records.TrialRecord`
     error_deg               steady-state error: true error at the end; of a lost object the whole angle
     survivor_error_deg      the same, of objects that were not lost
-    survivor_off_deg        rotation off the axis at the end, of objects that were not lost
     motions                 their number
     prediction_km, ...      mean over the motions of ``prediction_km_deg``, ...; NaN where there is none
     ======================  ===============================================================================
@@ -40,18 +33,11 @@ def trial_frame(results: Mapping[str, Iterable[Record]]) -> DataFrame:
         results: job -> its records.
     """
     rows = [
-        {
-            "job": job,
-            "grasped": record.grasped,
-            "reason": record.reason,
-            **vars(record),
-            **_added(record),
-        }
+        {"job": job, **vars(one), **_added(one), **one.more}
         for job, records in results.items()
-        for record in records
+        for one in records
     ]
-    columns = dict.fromkeys([*_COLUMNS, *(name for row in rows for name in row)])
-    return require("pandas").DataFrame(rows, columns=list(columns))
+    return require("pandas").DataFrame(rows).drop(columns="more")
 
 
 def select(trials: DataFrame, **wanted: Any) -> DataFrame:
@@ -62,18 +48,14 @@ def select(trials: DataFrame, **wanted: Any) -> DataFrame:
     return trials[chosen]
 
 
-def _added(record: Record) -> dict[str, Any]:
-    if not isinstance(record, TrialRecord):
-        return {"lost": False, "not_reached": False}
-    lost, angle = record.lost, abs(record.angle_deg)
-    names = [name for name in _ADDED if "prediction" in name]
-    made = {name: getattr(record, f"{name}_deg") for name in names}
+def _added(record: TrialRecord) -> dict[str, Any]:
+    made = {name: getattr(record, f"{name}_deg") for name in _PREDICTIONS}
     return {
-        "lost": lost,
+        "grasped": record.grasped,
+        "lost": record.lost,
         "not_reached": record.not_reached,
-        "error_deg": angle if lost else record.true_error_deg,
-        "survivor_error_deg": math.nan if lost else record.true_error_deg,
-        "survivor_off_deg": math.nan if lost else record.off_rotation_deg,
-        "motions": record.steps,
+        "error_deg": abs(record.angle_deg) if record.lost else record.true_error_deg,
+        "survivor_error_deg": math.nan if record.lost else record.true_error_deg,
+        "motions": record.steps if record.grasped else math.nan,
         **{name: float(np.mean(errors)) if errors else math.nan for name, errors in made.items()},
     }
