@@ -1,18 +1,21 @@
 """What learners say on streams that are meant to break them: NaN, and |g| by the largest |y| seen.
 
-A stream has units of x and y, an origin of x, a jitter of an input or output that stands still before it
-moves, and events. Each learner is asked for everything at the sample that comes, at the last one and far
-away, one query by one and as a batch. The tests of learners draw from them.
+``hostile_streams.py --seeds 1000:1040``; ``--quick`` runs short streams of one seed. A stream draws, from its
+seed, the units of x and y from 1e-9 to 1e9, an origin of x, a jitter from 1e-15 to 1e-2 of an input or output
+that stands still before it moves, and one or two events. Each learner is asked for everything at the sample
+that comes, at the last one and far away, one query by one and as a batch.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
 
+from torch_ekm.cli._app import parse_seeds
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernelSOGP,
@@ -111,6 +114,19 @@ class Hostile(NamedTuple):
         return (x + self.origin) * self.x_unit, y * self.y_unit
 
 
+def drawn(seed: int, n: int) -> Hostile:
+    """The stream of a seed."""
+    g = torch.Generator().manual_seed(seed)
+
+    def within(low: float, high: float) -> float:
+        return low + (high - low) * float(torch.rand((), generator=g))
+
+    events = torch.randperm(len(EVENTS), generator=g)[: 1 + seed % 2].tolist()
+    origin = (0.0, within(-1e3, 1e3))[seed % 3 == 0]
+    units = 10.0 ** within(-9.0, 9.0), 10.0 ** within(-9.0, 9.0)
+    return Hostile(seed, n, *units, origin, 10.0 ** within(-15.0, -2.0), tuple(EVENTS[e] for e in events))
+
+
 class Verdict(NamedTuple):
     """What a learner said on a stream: answers that are not finite, largest |g| over the largest |y| seen."""
 
@@ -134,3 +150,36 @@ def judge(learner: ResidualLearner, x: Tensor, y: Tensor) -> Verdict:
         learner.update(x[t], y[t])
         most = torch.maximum(most, y[t].abs())
     return Verdict(wrong, ratio)
+
+
+def table(seeds: Sequence[int], n: int, capacity: int) -> None:
+    """Each learner over all streams, and a last line over all learners."""
+    print("| learner | not finite | largest &#124;g&#124;/&#124;y&#124; | on |\n|---|---|---|---|")
+    found: list[Verdict] = []
+    for name, make in LEARNERS.items():
+        verdicts = [judge(make(capacity), *drawn(seed, n).samples()) for seed in seeds]
+        worst = max(range(len(seeds)), key=lambda i: (verdicts[i].not_finite, verdicts[i].ratio))
+        not_finite, events = sum(v.not_finite for v in verdicts), ", ".join(drawn(seeds[worst], n).events)
+        print(f"| {name} | {not_finite} | {verdicts[worst].ratio:.2f} | {events} |", flush=True)
+        found += verdicts
+    print(
+        f"\nstreams {len(seeds)}, learners {len(LEARNERS)}, NaN {sum(v.not_finite for v in found)}, "
+        f"largest |g|/|y| {max(v.ratio for v in found):.2f}"
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=parse_seeds, default=tuple(range(40)), help="FIRST:END")
+    parser.add_argument("--samples", type=int, default=240)
+    parser.add_argument("--quick", action="store_true")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    if options.quick:
+        table(options.seeds[:1], 20, 8)
+    else:
+        table(options.seeds, options.samples, 100)
+
+
+if __name__ == "__main__":
+    main()
