@@ -266,8 +266,6 @@ def test_errors_say_what_would_be_right(monkeypatch):
     monkeypatch.setattr(pinch, "_GUESSES", 1)  # the others fail too
     with pytest.raises(UnknownNameError, match="box"):
         SimulatedHand("icub_right", "bocks")
-    with pytest.raises(UnknownNameError, match="tendon"):
-        SimulatedHand("icub_right", "box", tendon="tape")
     with pytest.raises(UnknownNameError, match="thumb"):
         SimulatedHand("icub_right", "box", PlantConfig(thumb="toe"))
     with pytest.raises(GraspError, match="reset"):

@@ -49,7 +49,6 @@ class Rig:
         parameters: what they really are.
         remember: called every 0.01 s if the camera is late.
         engine: which physics, one of :data:`ENGINES`.
-        native: the engine runs the tendons, which change no more.
     """
 
     def __init__(
@@ -59,11 +58,10 @@ class Rig:
         config: PlantConfig,
         parameters: PlantParameters,
         remember: Callable[[TimedState], None],
-        engine: str = "sapien",
-        native: bool = False,
+        engine: str,
     ) -> None:
         self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
-        self.remember, self.engine, self.native = remember, engine, native
+        self.remember, self.engine = remember, engine
         self.transmission = make_transmission(hand, parameters)
         self.servo = Servo(
             hand.actuator_lower, hand.actuator_upper, parameters, config.relative_to, hand.actuator_backlash
@@ -80,9 +78,7 @@ class Rig:
     def _build(self) -> None:
         p = self.parameters
         obj, step = true_object(self.obj, p), self.config.time_step
-        self.scene = make_scene(
-            self.engine, self.hand, obj, step, p.contact_stiffness, self.transmission if self.native else None
-        )
+        self.scene = make_scene(self.engine, self.hand, obj, step, p.contact_stiffness)
         thumb, _ = opposing_pads(self.hand, self.config)
         pad = next(pad.link for pad in self.hand.pads if pad.name == thumb)
         finger = self._finger_of.get(pad)  # None: a part of the palm
@@ -177,11 +173,8 @@ class Rig:
             output = servo.move_to(motor_at(k / steps))
             if push is not None:
                 scene.push(*push)
-            if self.native:
-                scene.step(output - transmission.origin)
-            else:
-                q = scene.next_q if transmission.stiff else scene.q
-                scene.step(transmission.drive_targets(q, output))
+            q = scene.next_q if transmission.stiff else scene.q
+            scene.step(transmission.drive_targets(q, output))
             if self.parameters.latency > 0 and (begun + k) % often == 0:
                 self.remember(self.state._replace(time=self.time + k * self.config.time_step))
             if k > steps - window:
@@ -202,7 +195,7 @@ class Rig:
         """
         old, self.parameters = self.parameters, new
         self.servo.set_parameters(new)
-        if changes_transmission(old, new):
+        if _differ(old, new, *_TRANSMISSION):
             previous, self.transmission = self.transmission, make_transmission(self.hand, new)
             self.transmission.take_over(previous, self.scene.q, self.servo.output)
             self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
@@ -248,11 +241,6 @@ _TRANSMISSION = (
     "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase",
     "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed",
 )  # fmt: skip
-
-
-def changes_transmission(old: PlantParameters, new: PlantParameters) -> bool:
-    """Whether tendons, springs or joints become others."""
-    return _differ(old, new, *_TRANSMISSION)
 
 
 def _differ(old: PlantParameters, new: PlantParameters, *names: str) -> bool:
