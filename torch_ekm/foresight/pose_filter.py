@@ -111,7 +111,7 @@ class PoseFilter:
     def _predicted(self, moved: Tensor, force: Tensor | None) -> tuple[Tensor, Tensor]:
         """ds and Q before the contacts have their say; forces are carried along from motion to motion.
 
-        A state that the model refuses has no predicted motion, but one that may be as large as the actuators'.
+        A state that the model refuses has no predicted motion, but one as large as the actuators' may be.
         """
         known: dict[str, Any] = {"fingertip_force": force}
         if self._last is not None:

@@ -9,7 +9,7 @@ from .._noise import NOISE
 from ..description import HandDescription
 from ..exceptions import JointMismatchError, ShapeError
 from ..typing import Float, Tensor
-from .hall.calibration import HallCalibration, HallEstimate
+from .hall_calibration import HallCalibration, HallEstimate
 
 CHORDS = 20  # steps with typical arms where arms change with the posture
 
