@@ -209,7 +209,7 @@ def test_a_wrong_lens_or_mount_shows(hand, obj):
     assert 0.0005 < (stretched - exact).norm() < 0.02
 
 
-@pytest.mark.parametrize("turn", [-29.0, 0.0, 29.0])
+@pytest.mark.parametrize("turn", [-29.0, 29.0])
 @pytest.mark.parametrize("name", ["toothpaste", "applier", "box", "bottle", "can"])
 def test_every_object_is_seen_over_the_range_of_turns(hand, name, turn, simulated, rng):
     """Neither fingers nor palm nor object hide the boards: the default places of board and camera work."""

@@ -96,13 +96,6 @@ def test_noise_and_blur_have_the_stated_size(rng):
     assert image.mean() == pytest.approx(quality.background, abs=0.1)
 
 
-def test_same_generator_same_image(pose_of, simulated):
-    scene = CardScene((PlacedCard(MarkerBoard(), pose_of()),))
-    a, b, c = (simulated.render(scene, np.random.default_rng(s)) for s in (3, 3, 4))
-    np.testing.assert_array_equal(a, b)
-    assert (a != c).any()
-
-
 def test_cards_outside_or_behind_are_not_drawn(pose_of, rng):
     camera = SimulatedCamera(quality=CLEAN)
     empty = camera.render(CardScene(), rng)
