@@ -24,7 +24,7 @@ from .grasp_planning.pinch_problem import PinchRequest
 from .grasp_planning.remembered import remembered_pinch
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
-from .physics.rig import Rig, RigState
+from .physics.rig import Rig
 from .physics.scene import ENGINES
 from .presets import preset as parameters_of
 from .sensors import Sensors
@@ -39,7 +39,8 @@ _TILT = 5 * np.pi / 180  # [rad]: the object's long axis is drawn within +- this
 class PlantSnapshot(NamedTuple):
     """Everything needed to go back to a moment; give it to :meth:`SimulatedHand.restore`."""
 
-    rig: RigState
+    rig: tuple[bytes, dict[str, Any]]
+    parameters: PlantParameters
     sensors: Sensors
     generator: dict[str, Any]
     plan: PinchPlan
@@ -237,14 +238,14 @@ class SimulatedHand:
 
     def snapshot(self) -> PlantSnapshot:
         """Physics, sensors and noise of this moment, for :meth:`restore`."""
-        generator = dict(self._generator.bit_generator.state)
-        return PlantSnapshot(self._grasped().snapshot(), copy.deepcopy(self._sensors), generator, self.plan)
+        sensors, generator = copy.deepcopy(self._sensors), dict(self._generator.bit_generator.state)
+        return PlantSnapshot(self._grasped().snapshot(), self.parameters, sensors, generator, self.plan)
 
     def restore(self, snapshot: PlantSnapshot) -> Observation:
         """Go back to ``snapshot``, noise included; two restored runs are alike bit by bit."""
         rig = self._grasped()
-        if snapshot.rig.parameters != self.parameters:
-            self._adopt(snapshot.rig.parameters)
+        if snapshot.parameters != self.parameters:
+            self._adopt(snapshot.parameters)
         rig.restore(snapshot.rig)
         self._sensors = copy.deepcopy(snapshot.sensors)
         self._generator.bit_generator.state = snapshot.generator

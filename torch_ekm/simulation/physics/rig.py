@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ..config import PlantConfig
 from ..grasp_planning.pinch import PinchPlan, opposing_pads
 from ..mechanism.assembly import chain, make_transmission, true_object
 from ..mechanism.servo import Servo
-from ..mechanism.transmission import Transmission
 from ..parameters import PlantParameters
 from ..sensors import TimedState
 from .scene import make_scene
@@ -26,18 +25,6 @@ _RATE_LIMIT = 100 * np.pi / 180  # fastest motion of a motor [rad/s]
 _SPIN_UP = 0.02  # [s] until it runs so fast: the mechanical time constant of small geared motors
 _FURTHER = 0.5  # longest further wait for a still object [s]
 _CLOSING, _HOLDING, _SETTLING = 0.2, 0.3, 1.0  # [s] of a grasp, object held fixed in the first two
-
-
-class RigState(NamedTuple):
-    """All that changes in a :class:`Rig`, for :meth:`Rig.restore`; SI units, hand frame."""
-
-    physics: bytes
-    transmission: Transmission
-    servo: Servo
-    parameters: PlantParameters
-    normal: Array
-    fingers: int
-    time: float
 
 
 class Rig:
@@ -217,26 +204,20 @@ class Rig:
             sides.reverse()
         self.scene.set_friction(sides[0], sides[1])
 
-    def snapshot(self) -> RigState:
-        return RigState(
-            self.scene.snapshot(),
-            copy.deepcopy(self.transmission),
-            copy.deepcopy(self.servo),
-            self.parameters,
-            self.normal.copy(),
-            self.fingers,
-            self.time,
-        )
+    def snapshot(self) -> tuple[bytes, dict[str, Any]]:
+        """All that changes, for :meth:`restore`: of the physics, and of the rest by name."""
+        return self.scene.snapshot(), copy.deepcopy({name: getattr(self, name) for name in _CHANGING})
 
-    def restore(self, state: RigState) -> None:
+    def restore(self, state: tuple[bytes, dict[str, Any]]) -> None:
         """Go back to ``state``, taken with the parameters that hold now."""
-        if self._built_scale != state.parameters.object_scale:
+        if self._built_scale != self.parameters.object_scale:
             self._build()
-        self.scene.restore(state.physics)
-        self.transmission, self.servo = copy.deepcopy((state.transmission, state.servo))
-        self.normal, self.fingers, self.time = state.normal.copy(), state.fingers, state.time
+        physics, rest = state
+        self.scene.restore(physics)
+        vars(self).update(copy.deepcopy(rest))
 
 
+_CHANGING = ("transmission", "servo", "normal", "fingers", "time")
 _TRANSMISSION = (
     "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase",
     "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed",
