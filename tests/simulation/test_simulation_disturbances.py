@@ -99,8 +99,8 @@ def test_longer_tendons_loosen_the_grip(exact):
 def test_creep_loosens_the_grip_with_time_and_stops_when_switched_off(exact):
     exact.change(tendon_creep=0.01)
     forces = []
-    for _ in range(4):
-        exact.wait(1.0)
+    for _ in range(3):
+        exact.wait(0.7)
         forces.append(float(truth(exact.observe(), "fingertip_force")[0]))
     assert np.all(np.diff(forces) < -0.005)
     exact.change(tendon_creep=0.0)
@@ -166,23 +166,6 @@ def test_a_larger_object_opens_the_fingers(monkeypatch):
 
 
 # -- the position controller --------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("changes", "low", "high"),
-    [
-        ({"actuator_bias": 0.5 * DEG}, 0.1, 0.5),
-        ({"actuator_error": 0.5 * DEG}, 0.1, 0.5),
-        ({"dead_zone": 0.9 * DEG}, 0.9, 0.9),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
-)
-def test_controller_errors_show_on_the_encoders(exact, changes, low, high):
-    before = exact.observe()
-    exact.change(**changes)
-    error = (exact.command(ROLL).a - before.a - ROLL).abs() / DEG
-    moved = ROLL != 0
-    assert low - 1e-9 <= error[moved].max() <= high + 1e-9
 
 
 def test_backlash_hides_from_the_encoders_and_swallows_motion(exact, grasped):
