@@ -90,10 +90,9 @@ class JointEstimator:
         mean, P = self._prior
         H = self._H.expand(*way.shape[:-1], -1, -1)
         apart = self._apart.expand(*way.shape[:-1], -1)
+        tie = torch.full_like(apart, COUPLING_STD**2)
         residual = torch.cat([hall.q, way, apart], dim=-1) - self._H @ mean
-        noises = (
-            torch.cat([hall.std**2, s, torch.full_like(apart, COUPLING_STD**2)], dim=-1) for s in (trust, arms)
-        )
+        noises = (torch.cat([hall.std**2, variance, tie], dim=-1) for variance in (trust, arms))
         (q, _), (_, covariance) = (update(mean, P, residual, H, R) for R in noises)
         q = torch.from_numpy(q)
         q[..., self._joints] = q[..., self._joints].clamp(*hall.within)
