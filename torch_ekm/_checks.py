@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TypeVar
 
 from .exceptions import NonFiniteError, ParameterError, ShapeError
@@ -39,13 +39,7 @@ def check_counts(name: str, values: Iterable[int]) -> tuple[int, ...]:
 
 def check_positive(name: str, value: float) -> float:
     """``value`` as a positive finite float, or ParameterError."""
-    try:
-        good = math.isfinite(value) and value > 0
-    except (TypeError, ValueError, OverflowError):
-        good = False
-    if not good:
-        raise ParameterError(name, value, "positive and finite")
-    return float(value)
+    return _checked(name, value, lambda x: math.isfinite(x) and x > 0, "positive and finite")
 
 
 def check_sizes(name: str, values: float | Sequence[float] | Tensor, n: int) -> list[float]:
@@ -62,20 +56,21 @@ def check_sizes(name: str, values: float | Sequence[float] | Tensor, n: int) -> 
 
 def check_fraction(name: str, value: float) -> float:
     """``value`` as a float in (0, 1], or ParameterError."""
-    try:
-        good = 0 < value <= 1
-    except TypeError:
-        good = False
-    if not good:
-        raise ParameterError(name, value, "in (0, 1]")
-    return float(value)
+    return _checked(name, value, lambda x: 0 < x <= 1, "in (0, 1]")
 
 
 def check_share(name: str, value: float) -> float:
     """``value`` as a float in (0, 1), or ParameterError."""
-    if check_fraction(name, value) == 1:
-        raise ParameterError(name, value, "in (0, 1)")
-    return float(value)
+    return _checked(name, value, lambda x: 0 < x < 1, "in (0, 1)")
+
+
+def _checked(name: str, value: float, good: Callable[[float], bool], valid: str) -> float:
+    try:
+        if good(value):
+            return float(value)
+    except (TypeError, ValueError, OverflowError):
+        pass
+    raise ParameterError(name, value, valid)
 
 
 def check_shape(name: str, value: Tensor, shape: Sequence[int], hint: str = "") -> None:

@@ -119,22 +119,6 @@ def test_the_stated_uncertainty_holds(turned) -> None:
     assert stds[-1] < 1.2 * DEG
 
 
-def test_rolling_joints_and_gaps_enter_by_the_update_of_a_kalman_filter(turned, monkeypatch) -> None:
-    def gain(mean, P, residual, H, R, at=None):
-        R = torch.diag(R) if R.dim() == 1 else R
-        K = torch.linalg.solve(H @ P @ H.mT + R, H @ P).mT
-        if at is not None:
-            residual = residual + H @ (at - mean)
-        P = (P + P.mT - K @ H @ P - (K @ H @ P).mT) / 2
-        return (mean + K @ residual).numpy(), P.numpy()
-
-    found, _ = blind(turned)
-    monkeypatch.setattr(pose_filter, "update", gain)
-    plain, _ = blind(turned)
-    assert float(found.filter.state.minus(plain.filter.state).abs().max()) < 1e-12
-    torch.testing.assert_close(found.filter.covariance, plain.filter.covariance, rtol=1e-9, atol=1e-15)
-
-
 def test_the_camera_is_asked_when_the_uncertainty_says_so(turned) -> None:
     plant, seen = blind(turned, look_again=0.7 * DEG)
     looked = [s.info["estimate"]["looked"] for s in seen]

@@ -14,7 +14,7 @@ from torch_ekm.exceptions import ObjectLostError, ParameterError, StateError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
-from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, TrackStatus
+from torch_ekm.sensing import MarkerBoard, MarkerTracker, TrackStatus
 from torch_ekm.simulation import HallSensors, SensedPlant
 from torch_ekm.simulation.imaging.grasp_view import GraspView
 from torch_ekm.simulation.sensed_plant import ICUB_PALM_MOUNT
@@ -192,24 +192,7 @@ def test_raw_readings_of_an_observation(hand, obj):
     assert np.isfinite(corners).all()
 
 
-def test_a_wrong_lens_or_mount_shows(hand, obj):
-    """What the tracker takes for granted may be wrong, and then the pose is."""
-    mount = ICUB_PALM_MOUNT.copy()
-    mount[0, 3] += 0.004
-    board = MarkerBoard(4, mount=obj.marker_transform)
-    shifted = MarkerTracker(PinholeCamera(), MarkerBoard(0, mount=mount), board)
-    longer = MarkerTracker(PinholeCamera(fx=660, fy=660), MarkerBoard(0, mount=ICUB_PALM_MOUNT), board)
-    plant = SensedPlant(Puppet(hand), hand, obj)
-    seen = []
-    for tracker in (plant.tracker, shifted, longer):
-        plant.tracker = tracker
-        seen.append(plant.reset(0).position)
-    exact, moved, stretched = seen
-    torch.testing.assert_close(moved - exact, torch.tensor([0.004, 0, 0]).double(), atol=1e-9, rtol=0)
-    assert 0.0005 < (stretched - exact).norm() < 0.02
-
-
-@pytest.mark.parametrize("turn", [-29.0, 0.0, 29.0])
+@pytest.mark.parametrize("turn", [-29.0, 29.0])
 @pytest.mark.parametrize("name", ["toothpaste", "applier", "box", "bottle", "can"])
 def test_every_object_is_seen_over_the_range_of_turns(hand, name, turn, simulated, rng):
     """Neither fingers nor palm nor object hide the boards: the default places of board and camera work."""

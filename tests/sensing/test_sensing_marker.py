@@ -13,7 +13,6 @@ from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, Track, TrackStatus
 from torch_ekm.sensing.vision.board_pose import BoardPose
-from torch_ekm.simulation import SimulatedCamera
 from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard
 
 cv2 = pytest.importorskip("cv2")
@@ -54,23 +53,6 @@ def test_object_in_the_hand_frame(pose_of, mounted, simulated, rng):
     assert torch.rad2deg(turn).abs().max() < 0.4
 
 
-def test_covariance_of_the_object_pose(pose_of, mounted, rng):
-    """Moved mounts lever the errors of rotation into the position: the covariance must say so."""
-    tracker, scene = MarkerTracker(PinholeCamera(), *mounted), scene_of(pose_of, boards=mounted)
-    palm, obj = (card.pose for card in scene.cards)
-    truth = mounted[0].mount @ np.linalg.inv(palm) @ obj @ np.linalg.inv(mounted[1].mount)
-    camera = SimulatedCamera()
-    chi2 = []
-    for _ in range(25):
-        tracker.reset()
-        track = tracker.track(camera.render(scene, rng))
-        turn = log(track.rotation @ torch.from_numpy(truth[:3, :3].T.copy()))
-        twist = torch.cat([track.position - torch.from_numpy(truth[:3, 3].copy()), turn])
-        chi2.append(float(twist @ torch.linalg.solve(track.covariance, twist)))
-        assert torch.linalg.eigvalsh(track.covariance).min() > 0
-    assert 1.5 < np.mean(chi2) < 15  # 6 if errors of one scene were independent from image to image
-
-
 @pytest.mark.parametrize("which", [0, 1])
 def test_covariance_is_carried_into_the_hand_frame(pose_of, mounted, which):
     """One unit of variance along each direction of a board's twist, against finite differences."""
@@ -96,15 +78,13 @@ def test_covariance_is_carried_into_the_hand_frame(pose_of, mounted, which):
 def test_accuracy_at_nominal_noise():
     """The stated limits, on a few frames; those of 1000 frames are in docs/benchmarks/simulation.md."""
     result = measure_tracking(24, seed=0)
+    assert 2 < result.mean_chi2 < 10  # 6 where the covariance is right
     assert result.found == 1.0
     assert result.flips == 0
-    assert result.in_plane_deg < 0.15
-    assert result.out_of_plane_deg < 0.4
-    assert result.lateral_mm < 0.3
+    assert result.in_plane_deg < 0.03
+    assert result.out_of_plane_deg < 0.2
+    assert result.lateral_mm < 0.01
     assert abs(result.depth_bias_mm) < 0.2
-    corners = measure_tracking(24, seed=0, edges=False)
-    assert result.out_of_plane_deg < 0.6 * corners.out_of_plane_deg
-    assert result.in_plane_deg < 0.5 * corners.in_plane_deg
 
 
 @pytest.mark.parametrize(("hidden", "status"), [(0, TrackStatus.PALM_HIDDEN), (1, TrackStatus.OBJECT_HIDDEN)])

@@ -81,21 +81,6 @@ def test_without_fingertip_sensors_pads_touch_whose_gaps_the_joints_explain(hand
     assert float(lifted.q[index_2] - lifted.truth.q[index_2]) == pytest.approx(-0.15, abs=2e-3)
 
 
-def test_gaps_enter_by_gauss_newton(hand: SimulatedHand, monkeypatch: pytest.MonkeyPatch) -> None:
-    def gain(mean, P, residual, H, R, at, bounds):
-        K = torch.linalg.solve(H @ P @ H.T + torch.diag(R), H @ P).T
-        return (mean + K @ (residual + H @ (at - mean))).numpy().clip(*bounds), (P - K @ H @ P).numpy()
-
-    thumb = hand.hand.joint_names.index("thumb_0")
-    plants = [ContactAligned(Blurred(hand, thumb, 0.1), hand.hand, hand.object) for _ in range(2)]
-    seen = plants[0].plant.reset(0)
-    found = [plants[0].observation(seen)]
-    monkeypatch.setattr("torch_ekm.sensing.contact_alignment.update", gain)
-    found.append(plants[1].observation(seen))
-    torch.testing.assert_close(found[0].q, found[1].q, rtol=0, atol=1e-12)
-    torch.testing.assert_close(plants[0]._last[1], plants[1]._last[1], rtol=1e-9, atol=1e-15)
-
-
 def test_the_error_of_a_cable_lasts() -> None:
     """On a narrow object the thumb has two angles without a gap; and no angle where it does not touch."""
     with contextlib.closing(SimulatedHand("icub_right", "flashlight")) as hand:

@@ -13,7 +13,6 @@ from torch_ekm.simulation import (
     PRESETS,
     DisturbedPlant,
     PlantChange,
-    PlantConfig,
     PlantParameters,
     SimulatedHand,
     Tug,
@@ -24,13 +23,6 @@ pytest.importorskip("sapien")
 
 
 # -- the mechanism ------------------------------------------------------------------------------------
-
-
-def test_larger_pulleys_turn_the_object_less(exact, grasped):
-    nominal = turned(exact, ROLL)
-    exact.restore(grasped)
-    exact.change(moment_arm=1.3)
-    assert turned(exact, ROLL) / nominal == pytest.approx(1 / 1.3, abs=0.05)
 
 
 def test_one_pulley_changes_the_effect_of_one_actuator(exact, grasped):
@@ -107,8 +99,8 @@ def test_longer_tendons_loosen_the_grip(exact):
 def test_creep_loosens_the_grip_with_time_and_stops_when_switched_off(exact):
     exact.change(tendon_creep=0.01)
     forces = []
-    for _ in range(4):
-        exact.wait(1.0)
+    for _ in range(3):
+        exact.wait(0.7)
         forces.append(float(truth(exact.observe(), "fingertip_force")[0]))
     assert np.all(np.diff(forces) < -0.005)
     exact.change(tendon_creep=0.0)
@@ -116,15 +108,6 @@ def test_creep_loosens_the_grip_with_time_and_stops_when_switched_off(exact):
     still = float(truth(exact.observe(), "fingertip_force")[0])
     exact.wait(1.0)
     assert abs(float(truth(exact.observe(), "fingertip_force")[0]) - still) < 1e-3
-
-
-def test_finger_weight_pulls_the_joints():
-    light, heavy = (
-        SimulatedHand("icub_right", "box", parameters=PlantParameters(link_weight=weight)).reset(0)
-        for weight in (False, True)
-    )
-    difference = (truth(light) - truth(heavy)).abs().max()
-    assert 0.02 * DEG < difference < 3.0 * DEG
 
 
 def test_finger_weight_acts_at_once(exact, grasped):
@@ -185,23 +168,6 @@ def test_a_larger_object_opens_the_fingers(monkeypatch):
 # -- the position controller --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("changes", "low", "high"),
-    [
-        ({"actuator_bias": 0.5 * DEG}, 0.1, 0.5),
-        ({"actuator_error": 0.5 * DEG}, 0.1, 0.5),
-        ({"dead_zone": 0.9 * DEG}, 0.9, 0.9),
-    ],
-    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
-)
-def test_controller_errors_show_on_the_encoders(exact, changes, low, high):
-    before = exact.observe()
-    exact.change(**changes)
-    error = (exact.command(ROLL).a - before.a - ROLL).abs() / DEG
-    moved = ROLL != 0
-    assert low - 1e-9 <= error[moved].max() <= high + 1e-9
-
-
 def test_backlash_hides_from_the_encoders_and_swallows_motion(exact, grasped):
     def there_and_back():
         start = exact.observe()
@@ -214,19 +180,6 @@ def test_backlash_hides_from_the_encoders_and_swallows_motion(exact, grasped):
     exact.restore(grasped)
     exact.change(backlash=1.0 * DEG)
     assert there_and_back() > max(0.2, 5 * tight)
-
-
-def test_increments_on_the_setpoint_get_through_a_dead_zone():
-    ends = {}
-    for reference in ("encoder", "setpoint"):
-        config = PlantConfig(relative_to=reference)
-        plant = SimulatedHand("icub_right", "box", config, PlantParameters(dead_zone=1.0 * DEG))
-        start = plant.reset(0)
-        for _ in range(4):
-            last = plant.command(ROLL / 4)  # 0.5 to 0.75 deg: each one smaller than the dead zone
-        ends[reference] = motion(start, last)[1].norm() / DEG
-    assert ends["encoder"] < 0.05
-    assert ends["setpoint"] > 0.5
 
 
 # -- presets and events ----------------------------------------------------------------------------

@@ -41,18 +41,6 @@ def test_it_passes_the_checks_of_gymnasium():
     check_env(planar.unwrapped, skip_render_check=True)
 
 
-def test_two_environments_side_by_side_see_the_same(env):
-    other = make(parameters="nominal")
-    one = make(parameters="nominal")
-    start = [e.reset(seed=4)[0] for e in (one, other)]
-    np.testing.assert_array_equal(*start)
-    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (2, *one.action_space.shape)).astype(np.float32)
-    for action in actions:
-        a, b = (e.step(action) for e in (one, other))
-        np.testing.assert_array_equal(a[0], b[0])
-        assert a[1:4] == b[1:4]
-
-
 def test_observation_and_info_say_what_they_should(env):
     observation, info = env.reset(seed=1, options={"angle": 10 * DEG})
     hand = env.unwrapped.plant.hand

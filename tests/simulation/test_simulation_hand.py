@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -43,44 +42,21 @@ def grasped(plant):
     return plant.snapshot()
 
 
-def test_it_is_a_plant(plant):
-    assert isinstance(plant, Plant)
-
-
-def test_it_holds_still_for_ten_seconds(plant):
+def test_it_holds_still(plant):
     before = plant.reset(1)
+    assert isinstance(plant, Plant)
     assert before.status is PlantStatus.HELD
-    plant.wait(10.0)
+    plant.wait(3.0)
     moved, turned = motion(before, plant.observe())
     assert moved.norm() < 1e-4 / 100  # the target is 0.1 mm and 0.1 deg
     assert turned.norm() < 0.1 * DEG / 100
 
 
-def test_servos_and_tendons_take_no_longer_than_physx(plant, grasped):
-    """At 20 000 steps of PhysX a second, that is ten times real time; plant_hold.py measures it.
-
-    The least ratio of two parts that take turns; on a busy machine, where Python's part suffers more than
-    PhysX's, 2.4 to 2.8 were seen.
-    """
-    plant.restore(grasped)
-    physx = plant._rig.scene._system.step
-    ratios = []
-    for _ in range(20):
-        start = time.process_time()
-        plant.wait(0.1)
-        middle = time.process_time()
-        for _ in range(round(0.1 / plant.config.time_step)):
-            physx()
-        ratios.append((middle - start) / (time.process_time() - middle))
-    assert min(ratios) < 4.0
-
-
-@pytest.mark.parametrize("time_step", [0.002, 0.004])
-def test_longer_time_steps_hold_the_same_grasp(plant, grasped, time_step):
+def test_longer_time_steps_hold_the_same_grasp(plant, grasped):
     fine = plant.restore(grasped).truth
-    coarse = SimulatedHand("icub_right", "box", PlantConfig(time_step=time_step))
+    coarse = SimulatedHand("icub_right", "box", PlantConfig(time_step=0.004))
     before = coarse.reset(0)
-    coarse.wait(2.0)
+    coarse.wait(1.0)
     assert motion(before, coarse.observe())[0].norm() < 1e-6
     assert (before.truth.q - fine.q).abs().max() < 0.3 * DEG
 
@@ -101,9 +77,11 @@ def test_contact_forces_balance_the_weight(plant, grasped):
     assert abs(float(force[0] - force[1] - force[2])) < plant.object.mass * 9.81 + 0.2
 
 
-def test_pinch_force_is_what_was_asked(grasped):
-    for wanted in (3.0, 8.0):
-        plant = SimulatedHand("icub_right", "box", PlantConfig(pinch_force=wanted))
+def test_pinch_force_is_what_was_asked():
+    """By the settings, or by the hand."""
+    gentle = dataclasses.replace(load_hand("icub_right"), pinch_force=3.0)
+    for hand, config, wanted in (("icub_right", PlantConfig(pinch_force=8.0), 8.0), (gentle, None, 3.0)):
+        plant = SimulatedHand(hand, "box", config)
         assert plant.reset(0).fingertip_force[0] == pytest.approx(wanted, rel=0.03)
 
 
@@ -114,11 +92,6 @@ def test_centred_grasps_are_all_the_same():
         plant.reset(seed)
         plans.append(plant.plan.points)
     np.testing.assert_allclose(*plans, atol=1e-9)
-
-
-def test_a_hand_says_how_hard_it_pinches():
-    hand = dataclasses.replace(load_hand("icub_right"), pinch_force=3.0)
-    assert SimulatedHand(hand, "box").reset(0).fingertip_force[0] == pytest.approx(3.0, rel=0.03)
 
 
 def run(plant, seed):
@@ -153,14 +126,6 @@ def test_a_snapshot_can_be_returned_to_bit_by_bit():
     assert torch.equal(first, go_on())
 
 
-def test_restored_and_unbroken_runs_differ_by_micrometres(plant, grasped):
-    plant.reset(0)
-    unbroken = plant.command(ROLL).truth.position
-    plant.restore(grasped)
-    restored = plant.command(ROLL).truth.position
-    assert (unbroken - restored).norm() < 20e-6
-
-
 def test_a_command_takes_as_long_as_its_motors_and_the_rest_of_the_hand(plant, grasped):
     """A ramp of 100 deg/s, then two frames at 20 Hz, 0.8 s at most."""
     start = plant.restore(grasped)
@@ -170,28 +135,20 @@ def test_a_command_takes_as_long_as_its_motors_and_the_rest_of_the_hand(plant, g
         start = after
 
 
-def test_encoders_show_where_the_motors_went(plant, grasped):
-    start = plant.restore(grasped)
-    torch.testing.assert_close(plant.command(ROLL).a, start.a + ROLL)
-
-
 def test_rolling_fingers_turn_the_object_about_the_rotation_axis(plant, grasped):
-    start = plant.restore(grasped)
-    _, turned = motion(start, plant.command(ROLL))
+    start, end = plant.restore(grasped), plant.command(ROLL)
+    torch.testing.assert_close(end.a, start.a + ROLL)
+    _, turned = motion(start, end)
     axis = plant.rotation_axis
     assert axis.norm() == pytest.approx(1.0)
     assert axis[1] > 0.9  # the iCub's y: square to the planes in which thumb and fingers bend
     assert float(turned @ axis) > 1.5 * DEG
 
 
-def test_squeezing_raises_the_forces(plant, grasped):
-    start = plant.restore(grasped)
-    assert plant.command(SQUEEZE).fingertip_force[0] > start.fingertip_force[0] + 0.3
-
-
 def test_opening_the_hand_loses_the_object(plant, grasped):
-    plant.restore(grasped)
-    assert plant.command(-10 * SQUEEZE).status is PlantStatus.LOST
+    before = plant.restore(grasped)
+    assert plant.command(SQUEEZE).fingertip_force[0] > before.fingertip_force[0] + 0.3
+    assert plant.command(-11 * SQUEEZE).status is PlantStatus.LOST
 
 
 def test_a_hard_tug_loses_the_object_and_a_gentle_one_does_not(plant, grasped):
@@ -227,17 +184,16 @@ def test_a_held_object_does_not_grow(plant, grasped):
 def test_other_hands_hold_too(hand, gravity):
     plant = SimulatedHand(hand, "box", PlantConfig(gravity=gravity))
     before = plant.reset(0)
-    plant.wait(2.0)
+    plant.wait(1.0)
     moved, turned = motion(before, plant.observe())
     assert moved.norm() < 1e-5
     assert turned.norm() < 0.01 * DEG
 
 
-@pytest.mark.parametrize("name", ["cylinder_30mm", "cylinder_45mm"])
-def test_the_t42_pinches_and_turns_a_cylinder_as_its_model_says(name):
+def test_the_t42_pinches_and_turns_a_cylinder_as_its_model_says():
     """3 to 5 mm sideways, once the play is taken up, and a turn; both within 3 % of the model."""
-    plant = SimulatedHand("yale_t42", name)
-    before = plant.reset(0)
+    plant = SimulatedHand("yale_t42", "cylinder_30mm")
+    plant.reset(0)
     push = torch.tensor([-0.04, 0.04], dtype=torch.float64)
     before = plant.command(push)  # takes up the play
     linear = KinematicModel(plant.hand, plant.object).linearize(before.truth.state)
@@ -266,8 +222,6 @@ def test_errors_say_what_would_be_right(monkeypatch):
     monkeypatch.setattr(pinch, "_GUESSES", 1)  # the others fail too
     with pytest.raises(UnknownNameError, match="box"):
         SimulatedHand("icub_right", "bocks")
-    with pytest.raises(UnknownNameError, match="tendon"):
-        SimulatedHand("icub_right", "box", tendon="tape")
     with pytest.raises(UnknownNameError, match="thumb"):
         SimulatedHand("icub_right", "box", PlantConfig(thumb="toe"))
     with pytest.raises(GraspError, match="reset"):
@@ -292,8 +246,12 @@ def test_a_preset_is_given_by_name_or_as_parameters():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"spring": 0.0}, {"dead_zone": -1.0}, {"mass": float("nan")}, {"frame_loss": 2.0}, {"sprung": 1.0}],
-)
+    [
+        {"spring": 0.0}, {"dead_zone": -1.0}, {"mass": float("nan")}, {"frame_loss": 2.0}, {"sprung": 1.0},
+        {"arm_variation": 1.0}, {"friction_unevenness": 0.6}, {"tendon_coupling": 1.0},
+        {"cable_friction": -0.1}, {"hysteresis": 1.5}, {"force_scale": 0.5},
+    ],
+)  # fmt: skip
 def test_impossible_parameters_are_refused(changes):
     with pytest.raises(ParameterError, match=next(iter(changes))):
         PlantParameters().replace(**changes)

@@ -105,10 +105,8 @@ class BlindPose(PlantWrapper):
         if looked:
             self.looks += 1
             self.filter.look(seen.state, _covariance(seen))
-        at = self.filter.state
-        known = {
-            "pose_covariance": self.filter.pose_covariance, "axis_std": self.axis_std, "looked": looked,
-        }  # fmt: skip
+        at, P = self.filter.state, self.filter.pose_covariance
+        estimate = {"pose_covariance": P, "axis_std": self.axis_std, "looked": looked}
         # a dark camera cannot say that it does not see the object
         status = PlantStatus.HELD if seen.status is PlantStatus.NOT_SEEN else seen.status
         # estimated for now: it is no stale picture
@@ -120,7 +118,7 @@ class BlindPose(PlantWrapper):
             rotation=at.rotation,
             status=status,
             stamps=stamps,
-            info={**seen.info, "estimate": {**seen.info.get("estimate", {}), **known}},
+            info={**seen.info, "estimate": {**seen.info.get("estimate", {}), **estimate}},
         )
 
 

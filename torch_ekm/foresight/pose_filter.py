@@ -63,52 +63,32 @@ class PoseFilter:
         """Of the object's error twist ``(v; w)``, hand axes [m, rad]."""
         return self.covariance[-6:, -6:]
 
-    def start(
-        self,
-        seen: GraspState,
-        fingertip_force: Float[Tensor, " n_pads"] | None = None,
-        pose_covariance: Float[Tensor, "6 6"] | None = None,
-    ) -> None:
+    def start(self, seen: GraspState, force: Tensor | None, pose_covariance: Tensor | None) -> None:
         """Begin with what camera, joints and fingertips say.
 
         Args:
             seen: joints and pose as measured.
-            fingertip_force: normal force of each pad [N]; None: the pads near the object touch it.
+            force: normal force of each pad ``(n_pads,)`` [N]; None: the pads near the object touch it.
             pose_covariance: of the pose's error twist [m, rad]; None or NaN: 0.3 mm and 0.3 deg.
         """
-        n_q = seen.q.shape[-1]
-        P = seen.q.new_zeros(n_q + 6, n_q + 6)
-        P[:n_q, :n_q] = NOISE.joint**2 * torch.eye(n_q, dtype=P.dtype)
-        P[n_q:, n_q:] = self._seen_covariance(pose_covariance, P)
+        joints = NOISE.joint**2 * torch.eye(seen.q.shape[-1], dtype=seen.q.dtype)
+        P = torch.block_diag(joints, _seen_covariance(pose_covariance, seen.q))
         self.state, self.covariance, self._last = seen, self._permitted(P), None
-        self._update(None, fingertip_force)
+        self._update(None, force)
 
-    def move(
-        self,
-        moved: Float[Tensor, " n_a"],
-        fingertip_force: Float[Tensor, " n_pads"] | None = None,
-    ) -> None:
-        """Carry the state along with a motion. A state that the model refuses has no predicted motion, but
-        one that may be as large as the actuators', as far as contacts that roll allow.
+    def move(self, moved: Float[Tensor, " n_a"], force: Tensor | None) -> None:
+        """Carry the state along with a motion.
 
         Args:
             moved: w, of the encoders [rad].
-            fingertip_force: before it [N].
+            force: normal force of each pad before it ``(n_pads,)`` [N].
         """
         if self.kinematic.figures is not None:
             moved = self.kinematic.figures.pulled(moved)
-        lin = self._linearize(moved, fingertip_force)
-        ds = unsure = torch.zeros_like(self.covariance[0])
-        if lin is not None:
-            ds = lin.step(moved)
-            if self.enhanced is not None:
-                g, unsure = self.enhanced.correction(self.state, moved, len(ds))
-                ds = ds + g
-        Q = self._motion_covariance(moved, None if lin is None else ds, unsure)
+        ds, Q = self._predicted(moved, force)
         middle = self.state.plus(0.5 * ds)
         with contextlib.suppress(NoContactError):
-            contacts = self._touching(middle, fingertip_force)
-            kin = self.kinematic.contact_kinematics(middle, contacts)
+            kin = self.kinematic.contact_kinematics(middle, self._touching(middle, force))
             A, v, w = constraint_matrix(kin), *ds[-6:].split(3)
             way = torch.linalg.vector_norm(v + torch.linalg.cross(w.expand_as(kin.lever), kin.lever), dim=-1)
             slide = (NOISE.slip * way + 1e-5)[[row // 6 for row in kin.rows]]
@@ -116,45 +96,42 @@ class PoseFilter:
         self.state = self.state.plus(ds)
         self.covariance = self.covariance + Q
 
-    def measure(self, q: Float[Tensor, " n_q"], fingertip_force: Float[Tensor, " n_pads"] | None) -> None:
-        """What measured joints [rad] and fingertips [N] say at rest."""
+    def measure(self, q: Float[Tensor, " n_q"], force: Tensor | None) -> None:
+        """What measured joints [rad] and fingertips ``(n_pads,)`` [N] say at rest."""
         joints = torch.eye(len(q), len(self.covariance), dtype=q.dtype)
-        variance = NOISE.joint**2 * torch.eye(len(q), dtype=q.dtype)
-        self._update((joints, variance, lambda at: q - at.q), fingertip_force)
+        noise = NOISE.joint**2 * torch.eye(len(q), dtype=q.dtype)
+        self._update((joints, noise, lambda at: q - at.q), force)
 
-    def look(self, seen: GraspState, pose_covariance: Float[Tensor, "6 6"] | None = None) -> None:
+    def look(self, seen: GraspState, pose_covariance: Tensor | None) -> None:
         """What the camera says; the joints of ``seen`` are not used. See :meth:`start`."""
         pose = torch.eye(len(self.covariance), dtype=self.covariance.dtype)[-6:]
-        variance = self._seen_covariance(pose_covariance, self.covariance)
-        self._update((pose, variance, lambda at: seen.minus(at)[-6:]), None, gaps=False)
+        noise = _seen_covariance(pose_covariance, pose)
+        self._update((pose, noise, lambda at: seen.minus(at)[-6:]), None, gaps=False)
 
-    def _seen_covariance(self, stated: Tensor | None, like: Tensor) -> Tensor:
-        if stated is not None and bool(torch.isfinite(stated).all()):
-            return stated.to(like)
-        return torch.diag(like.new_tensor(NOISE.pose).square())
+    def _predicted(self, moved: Tensor, force: Tensor | None) -> tuple[Tensor, Tensor]:
+        """ds and Q before the contacts have their say; forces are carried along from motion to motion.
 
-    def _linearize(self, moved: Tensor, fingertip_force: Tensor | None) -> Linearization | None:
-        """The model at the state, with forces carried along from motion to motion; None: it refuses."""
-        known: dict[str, Any] = {"fingertip_force": fingertip_force}
+        A state that the model refuses has no predicted motion, but one as large as the actuators' may be.
+        """
+        known: dict[str, Any] = {"fingertip_force": force}
         if self._last is not None:
             known |= {"previous": self._last[0], "expected": self._last[0].forces_after(self._last[1])}
+        n_q, largest = self.state.q.shape[-1], moved.abs().max()
+        unit = moved.new_tensor([CHARACTERISTIC_LENGTH] * 3 + [1.0] * 3)
+        ds = unsure = torch.zeros_like(self.covariance[0])
         try:
             lin = self.kinematic.linearize(self.state, **known)
         except GraspError:
-            return None
-        self._last = (lin, moved) if lin.forces.solved else None
-        return lin
-
-    def _motion_covariance(self, moved: Tensor, ds: Tensor | None, unsure: Tensor) -> Tensor:
-        """Q before the contacts have their say; ``unsure`` is the learner's variance."""
-        n_q, largest = self.state.q.shape[-1], moved.abs().max()
-        unit = moved.new_tensor([CHARACTERISTIC_LENGTH] * 3 + [1.0] * 3)
-        share, size = 1.0, largest
-        if ds is not None:
-            share = NOISE.described if self.enhanced is None else NOISE.share
-            size = torch.linalg.vector_norm(ds[n_q:] / unit)
-        std = torch.cat([NOISE.joint_motion * largest.expand(n_q), share * size * unit])
-        return self._permitted(torch.diag(std.square() + 1e-14 + unsure))
+            pose = largest * unit
+        else:
+            self._last, share = (lin, moved) if lin.forces.solved else None, NOISE.described
+            ds = lin.step(moved)
+            if self.enhanced is not None:
+                g, unsure = self.enhanced.correction(self.state, moved, len(ds))
+                ds, share = ds + g, NOISE.share
+            pose = share * torch.linalg.vector_norm(ds[n_q:] / unit) * unit
+        std = torch.cat([NOISE.joint_motion * largest.expand(n_q), pose])
+        return ds, self._permitted(torch.diag(std.square() + 1e-14 + unsure))
 
     def _permitted(self, covariance: Tensor) -> Tensor:
         """Conditioned on couplings, joints that do not move, and the plane of a planar hand:
@@ -162,7 +139,7 @@ class PoseFilter:
         Z = self.kinematic.reduction.basis.to(covariance)
         return Z @ torch.linalg.inv(Z.mT @ torch.linalg.solve(covariance, Z)) @ Z.mT
 
-    def _touching(self, state: GraspState, fingertip_force: Tensor | None) -> ContactSet:
+    def _touching(self, state: GraspState, force: Tensor | None) -> ContactSet:
         """Contacts of the pads that press.
 
         Raises:
@@ -171,11 +148,9 @@ class PoseFilter:
         if not self.touch:
             raise NoContactError("touch does not count")
         contacts: ContactSet = self._detector(state.q, state.position, state.rotation)
-        if fingertip_force is None:
-            pressing = contacts.gap <= self.kinematic.options.contact_margin
-        else:
-            pads = self.kinematic.hand.pad_indices(contacts.finger)
-            pressing = fingertip_force[pads] >= NOISE.pressing
+        pressing = contacts.gap <= self.kinematic.options.contact_margin
+        if force is not None:
+            pressing = force[self.kinematic.hand.pad_indices(contacts.finger)] >= NOISE.pressing
         rows = torch.nonzero(pressing).flatten().tolist()
         if not rows:
             raise NoContactError("no pad measures a force")
@@ -200,3 +175,9 @@ class PoseFilter:
                     noise = torch.block_diag(noise, torch.diag(gap))
             ds, self.covariance = map(torch.from_numpy, update(0 * ds, P, miss, H, noise, at=ds))
         self.state = prior.plus(ds)
+
+
+def _seen_covariance(stated: Tensor | None, like: Tensor) -> Tensor:
+    if stated is not None and bool(torch.isfinite(stated).all()):
+        return stated.to(like)
+    return torch.diag(like.new_tensor(NOISE.pose).square())

@@ -34,15 +34,13 @@ class Picture:
         require("pyvista")
         self._plotter = drawing.Plotter(_meshes(scene), len(scene.transforms), size, smooth)
 
-    def draw(
-        self, scene: Scene, path: Path | None = None, camera: drawing.Camera | None = None
-    ) -> NDArray[np.uint8]:
-        """A scene of the same shapes, ``(height, width, 3)``; also written to ``path``.
+    def draw(self, scene: Scene, camera: drawing.Camera | None = None) -> NDArray[np.uint8]:
+        """A scene of the same shapes, ``(height, width, 3)``.
 
         Args:
             camera: position, focus and up; that of the scene if None.
         """
-        return self._plotter.draw(scene.transforms, camera or scene.camera, path)
+        return self._plotter.draw(scene.transforms, camera or scene.camera)
 
     def close(self) -> None:
         """Close the off-screen window and release its memory."""

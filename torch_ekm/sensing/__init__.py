@@ -8,7 +8,7 @@ readings."""
 from __future__ import annotations
 
 from .contact_alignment import ContactAligned
-from .hall.calibration import HallCalibration
+from .hall_calibration import HallCalibration
 from .joint_estimator import JointEstimator
 from .vision.board import MarkerBoard
 from .vision.camera import PinholeCamera

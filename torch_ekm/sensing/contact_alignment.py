@@ -118,10 +118,8 @@ class ContactAligned(PlantWrapper):
         at_q = expected.numpy()
         J_a = torch.from_numpy(self.hand.lengths.jacobian(at_q, self.hand.actuation_jacobian))
         way = seen.a - torch.from_numpy(self.hand.actuator_offset)
-        differs, M = (
-            torch.cat([-at, seen.a - torch.from_numpy(self.hand.unloaded(at_q))]),
-            torch.cat([H, J_a]),
-        )
+        M = torch.cat([H, J_a])
+        differs = torch.cat([-at, seen.a - torch.from_numpy(self.hand.unloaded(at_q))])
         R = torch.cat([torch.full_like(at, NOISE.gap**2), NOISE.encoder**2 + (NOISE.arm * way) ** 2])
         for pad in ((gap.abs() > _OPEN) & (at.abs() < _FAR)).nonzero().flatten().tolist():
             likely: dict[int, float] = {}
@@ -151,14 +149,11 @@ class ContactAligned(PlantWrapper):
         """Pads that are in contact: by their force, or else by a gap that the joints' deviations explain."""
         names = [pad.name for pad in self.hand.pads]
         if seen.fingertip_force is not None:
-            return [
-                name
-                for name, f in zip(names, seen.fingertip_force.tolist(), strict=True)
-                if f >= NOISE.pressing
-            ]
-        gap, H = self._gaps(seen, q, names)
-        std = ((H @ P * H).sum(-1) + NOISE.gap**2).sqrt()
-        return [name for name, near in zip(names, (gap.abs() < _GATE * std).tolist(), strict=True) if near]
+            touch = seen.fingertip_force >= NOISE.pressing
+        else:
+            gap, H = self._gaps(seen, q, names)
+            touch = gap.abs() < _GATE * ((H @ P * H).sum(-1) + NOISE.gap**2).sqrt()
+        return [name for name, touches in zip(names, touch.tolist(), strict=True) if touches]
 
     def _gaps(
         self, seen: Observation, q: Float[Tensor, " n_q"], pads: list[str]

@@ -7,9 +7,10 @@ import torch
 from .._checks import check_finite
 from .._noise import NOISE
 from ..description import HandDescription
+from ..estimation.update import update
 from ..exceptions import JointMismatchError, ShapeError
 from ..typing import Float, Tensor
-from .hall.calibration import HallCalibration, HallEstimate
+from .hall_calibration import HallCalibration, HallEstimate
 
 CHORDS = 20  # steps with typical arms where arms change with the posture
 
@@ -57,12 +58,10 @@ class JointEstimator:
         self._J_a = torch.from_numpy(hand.actuation_jacobian.copy())
         self._offset = torch.from_numpy(hand.actuator_offset)
         C = torch.from_numpy(hand.coupling.copy())
+        self._H, self._apart = torch.cat([self._select, self._J_a, C]), C @ torch.from_numpy(hand.spring_rest)
         lower, upper = (torch.from_numpy(x.copy()) for x in (hand.joint_lower, hand.joint_upper))
-        # a locked joint has no range: a small one keeps the information finite
-        prior = 12 / (upper - lower).clamp(min=1e-3) ** 2
-        rest = torch.from_numpy(hand.spring_rest)
-        self._middle = prior * (lower + upper) / 2 + C.mT @ (C @ rest) / COUPLING_STD**2
-        self._fixed = torch.diag(prior) + C.mT @ C / COUPLING_STD**2
+        # a locked joint has no range: a small one keeps its variance above zero
+        self._prior = (lower + upper) / 2, torch.diag((upper - lower).clamp(min=1e-3) ** 2 / 12)
 
     def __call__(
         self, readings: Float[Tensor, "*batch n_channels"], actuators: Float[Tensor, "*batch n_a"]
@@ -84,17 +83,17 @@ class JointEstimator:
 
     def _linear(self, hall: HallEstimate, way: Tensor) -> JointEstimate:
         """With typical moment arms; way: the encoders less their offsets, and less what the arms bend."""
-        J_a = self._J_a
-        weight, S = hall.std**-2, self._select
-        unread = 1 - (hall.std < ENCODER_STD).to(J_a.dtype) @ S
-        blind = unread @ J_a.mT.abs() > 0  # a joint of the actuator has no channel that says more
-        read = self._fixed + S.mT @ (weight[..., None] * S)
-        arms = 1 / (ENCODER_STD**2 + (ARM_STD * way) ** 2)
-        trust = torch.where(blind, ENCODER_STD**-2, arms)  # all that there is: no pull towards mid-range
-        information = read + J_a.mT @ (trust[..., None] * J_a)
-        right = self._middle + (weight * hall.q) @ S + (trust * way) @ J_a
-        factor = torch.linalg.cholesky(information)
-        q = torch.cholesky_solve(right[..., None], factor)[..., 0]
+        unread = 1 - (hall.std < ENCODER_STD).to(way) @ self._select
+        blind = unread @ self._J_a.mT.abs() > 0  # a joint of the actuator has no channel that says more
+        arms = ENCODER_STD**2 + (ARM_STD * way) ** 2
+        trust = torch.where(blind, ENCODER_STD**2, arms)  # all that there is: no pull towards mid-range
+        mean, P = self._prior
+        H = self._H.expand(*way.shape[:-1], -1, -1)
+        apart = self._apart.expand(*way.shape[:-1], -1)
+        tie = torch.full_like(apart, COUPLING_STD**2)
+        residual = torch.cat([hall.q, way, apart], dim=-1) - self._H @ mean
+        noises = (torch.cat([hall.std**2, variance, tie], dim=-1) for variance in (trust, arms))
+        (q, _), (_, covariance) = (update(mean, P, residual, H, R) for R in noises)
+        q = torch.from_numpy(q)
         q[..., self._joints] = q[..., self._joints].clamp(*hall.within)
-        factor = torch.linalg.cholesky(read + J_a.mT @ (arms[..., None] * J_a))
-        return JointEstimate(q, torch.cholesky_inverse(factor))
+        return JointEstimate(q, torch.from_numpy(covariance))

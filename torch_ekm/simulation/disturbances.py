@@ -73,20 +73,18 @@ class DisturbedPlant(PlantWrapper):
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Let happen what is due, then move the actuators by ``delta_a`` [rad] and read the sensors."""
-        return self._told(self._happen(), self.plant.command(delta_a))
+        return self._after_events(lambda: self.plant.command(delta_a))
 
     def _followed(self, path: Path, watch: Callable[[Observation], bool]) -> Observation:
         """The same before a movement, which counts as one command."""
-        return self._told(self._happen(), self.plant.follow(path, watch))
+        return self._after_events(lambda: self.plant.follow(path, watch))
 
-    def _happen(self) -> tuple[PlantChange | Tug, ...]:
+    def _after_events(self, move: Callable[[], Observation]) -> Observation:
         due = tuple(event for event in self.events if event.at == self.count)
         for event in due:
             event.happen(self.plant)
         self.count += 1
-        return due
-
-    def _told(self, due: tuple[PlantChange | Tug, ...], observation: Observation) -> Observation:
+        observation = move()
         if due:
             observation.info["events"] = due
         return observation

@@ -128,18 +128,16 @@ class InHandRotation(gymnasium.Env):
         self._target = float((options or {}).get("angle", self.np_random.uniform(*self.angles)))
         self._start = self.plant.reset(int(self.np_random.integers(2**31)))
         self._axis = self.plant.rotation_axis
-        return self._observation(self._start), self._info(self._start)
+        return self._told(self._start)[:2]
 
     def step(self, action: NDArray[Any]) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Move the actuators and let the hand settle."""
         delta = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) * self.step_limit
         observation = self.plant.command(torch.from_numpy(delta))
-        turned, off = self._turned(observation)
-        to_go = self._target - turned
-        lost = observation.status is PlantStatus.LOST
-        reached = not lost and abs(to_go) < _TOLERANCE
+        told, info, to_go, off = self._told(observation)
+        lost, reached = observation.status is PlantStatus.LOST, info["is_success"]
         reward = -(abs(to_go) + _OFF_AXIS * off) / (10 * _DEG) + reached - _LOST * lost
-        return self._observation(observation), float(reward), lost or reached, False, self._info(observation)
+        return told, float(reward), lost or reached, False, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """A picture ``(height, width, 3)`` of the true state, or None without a render mode."""
@@ -159,36 +157,29 @@ class InHandRotation(gymnasium.Env):
             self._picture.close()
             self._picture = None
 
-    def _turned(self, observation: Observation) -> tuple[float, float]:
-        """Angle about the grasp's axis and rotation about all others since the reset [rad]."""
+    def _told(self, observation: Observation) -> tuple[Array, dict[str, Any], float, float]:
+        """Observation and info; the angle still to turn about the grasp's axis, and what turned about others
+        since the reset [rad]."""
         assert self._start is not None
+        assert observation.truth is not None
         rotation = log(observation.rotation @ self._start.rotation.mT)
         turned = float(rotation @ self._axis)
-        return turned, float(torch.linalg.vector_norm(rotation - turned * self._axis))
-
-    def _observation(self, observation: Observation) -> Array:
-        assert self._start is not None
-        turned, _ = self._turned(observation)
+        to_go, off = self._target - turned, float(torch.linalg.vector_norm(rotation - turned * self._axis))
         parts = (
             observation.q,
             observation.a,
             observation.position - self._start.position,
-            log(observation.rotation @ self._start.rotation.mT),
+            rotation,
             *(() if observation.fingertip_force is None else (observation.fingertip_force,)),
-            torch.tensor([turned, self._target - turned], dtype=torch.float64),
+            torch.tensor([turned, to_go], dtype=torch.float64),
         )
-        space = self.observation_space
-        return np.clip(torch.cat(parts).numpy(), space.low, space.high)  # type: ignore[attr-defined]
-
-    def _info(self, observation: Observation) -> dict[str, Any]:
-        turned, _ = self._turned(observation)
-        held = observation.status is not PlantStatus.LOST
-        assert observation.truth is not None
-        return {
-            "is_success": held and abs(self._target - turned) < _TOLERANCE,
+        space: Any = self.observation_space
+        info = {
+            "is_success": observation.status is not PlantStatus.LOST and abs(to_go) < _TOLERANCE,
             "status": observation.status.value,
             "truth": {name: value.numpy() for name, value in observation.truth.arrays().items()},
         }
+        return np.clip(torch.cat(parts).numpy(), space.low, space.high), info, to_go, off
 
 
 gymnasium.register("torch_ekm/InHandRotation-v0", f"{__name__}:InHandRotation", max_episode_steps=40)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import ObjectLostError, StateError
 from ..plant import Observation, Plant, PlantStatus, PlantWrapper, Truth
-from ..sensing.hall.calibration import HallCalibration
+from ..sensing.hall_calibration import HallCalibration
 from ..sensing.joint_estimator import JointEstimator
 from ..sensing.vision.board import MarkerBoard
 from ..sensing.vision.track import Track

@@ -24,15 +24,11 @@ from .grasp_planning.pinch_problem import PinchRequest
 from .grasp_planning.remembered import remembered_pinch
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
-from .physics.rig import Rig, RigState, changes_transmission
+from .physics.rig import Rig
 from .physics.scene import ENGINES
 from .presets import preset as parameters_of
 from .sensors import Sensors
 
-_NOT_NATIVE = (
-    "joint_friction", "arm_variation", "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling",
-    "joint_play",
-)  # fmt: skip
 _ATTEMPTS = 5
 _LONGEST_REST = 0.8  # [s] that rest is waited for after a motion
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
@@ -43,7 +39,8 @@ _TILT = 5 * np.pi / 180  # [rad]: the object's long axis is drawn within +- this
 class PlantSnapshot(NamedTuple):
     """Everything needed to go back to a moment; give it to :meth:`SimulatedHand.restore`."""
 
-    rig: RigState
+    rig: tuple[bytes, dict[str, Any]]
+    parameters: PlantParameters
     sensors: Sensors
     generator: dict[str, Any]
     plan: PinchPlan
@@ -68,12 +65,10 @@ class SimulatedHand:
         parameters: what the plant really is; as described by default.
         preset: the parameters by name, as :func:`torch_ekm.simulation.preset` takes it.
         engine: the physics, "sapien" or "mujoco" (extra ``mujoco``).
-        tendon: "computed" here, or "native": by MuJoCo, where they have neither friction nor departures of
-            another kind; they cannot be changed in mid-run.
 
     Raises:
-        UnknownNameError: no such hand, object, preset, engine or kind of tendon; the message lists them.
-        ParameterError: both ``parameters`` and ``preset`` are given; native tendons cannot be as they say.
+        UnknownNameError: no such hand, object, preset or engine; the message lists them.
+        ParameterError: both ``parameters`` and ``preset`` are given.
     """
 
     def __init__(
@@ -84,7 +79,6 @@ class SimulatedHand:
         parameters: PlantParameters | None = None,
         preset: str | None = None,
         engine: str = "sapien",
-        tendon: str = "computed",
     ) -> None:
         if parameters is not None and preset is not None:
             valid = "None with parameters: preset(name).replace(...) changes single figures of a preset"
@@ -100,7 +94,6 @@ class SimulatedHand:
         if self.config.gravity is not None:
             self.hand = dataclasses.replace(self.hand, gravity=self.config.gravity)
         self.parameters = parameters_of(preset or "none") if parameters is None else parameters
-        self._native = self._checked(tendon)
         self._problem = pinch_problem(self.hand, self.object, self.config, self.parameters)
         self._sensors = Sensors(self.parameters, self.hand.n_q, len(self.hand.pads), self.hand.joint_names)
         self._generator = np.random.default_rng(0)
@@ -127,7 +120,6 @@ class SimulatedHand:
                 self.parameters,
                 lambda frame: self._sensors.remember(frame),  # a restored plant has other sensors
                 self.engine,
-                self._native,
             )
         if self._ungraspable is not None:
             raise self._ungraspable
@@ -246,14 +238,14 @@ class SimulatedHand:
 
     def snapshot(self) -> PlantSnapshot:
         """Physics, sensors and noise of this moment, for :meth:`restore`."""
-        generator = dict(self._generator.bit_generator.state)
-        return PlantSnapshot(self._grasped().snapshot(), copy.deepcopy(self._sensors), generator, self.plan)
+        sensors, generator = copy.deepcopy(self._sensors), dict(self._generator.bit_generator.state)
+        return PlantSnapshot(self._grasped().snapshot(), self.parameters, sensors, generator, self.plan)
 
     def restore(self, snapshot: PlantSnapshot) -> Observation:
         """Go back to ``snapshot``, noise included; two restored runs are alike bit by bit."""
         rig = self._grasped()
-        if snapshot.rig.parameters != self.parameters:
-            self._adopt(snapshot.rig.parameters)
+        if snapshot.parameters != self.parameters:
+            self._adopt(snapshot.parameters)
         rig.restore(snapshot.rig)
         self._sensors = copy.deepcopy(snapshot.sensors)
         self._generator.bit_generator.state = snapshot.generator
@@ -273,13 +265,11 @@ class SimulatedHand:
 
         Raises:
             ParameterError: an unknown name, or a wrong figure; nothing is changed.
-            StateError: ``object_scale`` while there is a grasp, or native tendons; nothing is changed.
+            StateError: ``object_scale`` while there is a grasp; nothing is changed.
         """
         new = self.parameters.replace(**changes)
         if self._rig is not None and new.object_scale != self.parameters.object_scale:
             raise StateError("the object is held, and cannot grow: close(), change object_scale, reset(seed)")
-        if self._native and changes_transmission(self.parameters, new):
-            raise StateError('native tendons do not change in mid-run; make the hand with tendon="computed"')
         self._adopt(new)
 
     def tug(self, force: Array, torque: Array, duration: float = 0.05) -> Observation:
@@ -307,23 +297,6 @@ class SimulatedHand:
                     break
                 before = frame
         return self.observe()
-
-    def _checked(self, tendon: str) -> bool:
-        """Whether the engine runs the tendons."""
-        if tendon not in ("computed", "native"):
-            raise UnknownNameError("tendon", tendon, ("computed", "native"))
-        if tendon == "computed":
-            return False
-        if self.engine != "mujoco":
-            raise ParameterError("tendon", tendon, '"computed" in SAPIEN; "native" needs engine="mujoco"')
-        if not self.hand.lengths.constant or self.hand.tendon_springs or self.hand.loops:
-            valid = f"\"computed\": '{self.hand.name}' has arms that change, tendon springs or loops"
-            raise ParameterError("tendon", tendon, valid)
-        lost = [name for name in _NOT_NATIVE if getattr(self.parameters, name) != 0]
-        lost = [name for name in lost if name != "joint_friction" or self.hand.joint_friction.any()]
-        if lost:
-            raise ParameterError("tendon", tendon, f'"computed", or {", ".join(lost)} = 0: MuJoCo has none')
-        return True
 
     def _adopt(self, parameters: PlantParameters) -> None:
         self._problem = pinch_problem(self.hand, self.object, self.config, parameters)  # may refuse: first

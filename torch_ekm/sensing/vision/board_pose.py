@@ -1,25 +1,35 @@
-"""Pose of one marker board from its corners in the image."""
+"""Pose of one marker board, from the corners and the edges of its markers in the image."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ..._extras import require
 from ...kinematics.se3 import hat
 from ...typing import Array
+from .board import MarkerBoard
 from .camera import PinholeCamera
 
 _CORNER_STD = 0.20  # of one coordinate of a detected corner [px]
 _MAX_RESIDUAL = 1.0  # a corner farther than this from the fitted board is left out [px]
 _MIN_CORNERS = 6  # fewer do not make a pose
+_ITERATIONS = 3
+_EDGE_STD = 0.03  # of the place of an edge [px]
+_REACH = 2.0  # a point of the board that moves farther went to the edge of something else [px]
+_PER_SIDE = 12  # places looked at along each side of a marker
+_CORRELATED = 3.0  # samples along a side share their errors: three count as one
+_STEP = 0.25  # distance of samples across the edge [px]
 
 
 @dataclass(frozen=True, eq=False)
 class BoardPose:
-    """Pose of a board in the camera frame, and how well the corners determine it."""
+    """Pose of a board in the camera frame, and how well the edges determine it."""
 
     rotation: Array
     """Board frame to camera frame, ``(3, 3)``."""
@@ -29,101 +39,219 @@ class BoardPose:
     """Of the twist ``(v; w)`` of the card about its centre, camera axes, ``(6, 6)`` [m, rad]."""
     ambiguous: bool
     """Another pose explains the image as well; ``prior`` decided, if one was given."""
-    mirror: tuple[Array, Array] | None = None
-    """Rotation and position of the other local minimum, unless it is clearly worse."""
+
+
+class _Fit(NamedTuple):
+    rotation: Array
+    position: Array
+    covariance: Array
+    residual: Array
+    """Distance of each side point from its edge, infinite where there is none, ``(n,)`` [px]."""
 
 
 def estimate_board_pose(
-    camera: PinholeCamera, object_points: Array, image_points: Array, prior: Array | None = None
+    image: NDArray[np.uint8],
+    camera: PinholeCamera,
+    board: MarkerBoard,
+    markers: Mapping[int, Array],
+    prior: Array | None = None,
 ) -> BoardPose | None:
-    r"""``min_{R, t} sum_i |u_i - pi(R X_i + t)|^2`` over the corners that agree.
+    r"""``min_{R, t} sum_i (n_i . (e_i - pi(R X_i + t)))^2``: sides of markers against edges in the image.
 
-    A planar target has two local minima, mirrored about the line of sight. Both are computed in
-    closed form (IPPE, Collins and Bartoli, IJCV 2014) and refined by Levenberg-Marquardt; the
-    better one counts, and the other is kept as ``mirror`` unless it is worse by a hundred units of
-    ``chi^2 = sum r^2 / sigma_c^2``, ``sigma_c = 0.2 px`` of a corner. Where it is worse by less than
-    nine and the two differ by more than 10 deg the result is ``ambiguous``, and the one nearer to
-    ``prior`` is taken.
+    Four corners of a marker rest on a few pixels each, and blur draws detected corners outwards; its
+    four sides rest on a hundred pixels, and a symmetric blur leaves an edge where it is. So corners only
+    give the start. Across each side the grey level rises from black to white; the area under the profile,
+    ``s = s_max - int (I - I_black) / (I_white - I_black) ds``, gives the edge along the normal
+    ``n_i``. Places that do not look like an edge of the board (a finger before it, glare) are left
+    out, and so are those beyond three robust deviations. Gauss-Newton on the twist, three times.
 
-    Corners farther than 1 px from the fit, or than four robust deviations, are left
-    out, the worst first (a corner half hidden by a finger is found, but at a wrong place).
-
-    The covariance is ``sigma^2 (J^T J)^-1`` with ``sigma`` the larger of ``sigma_c`` and the
-    residual's own estimate.
+    A planar target has two local minima, mirrored about the line of sight. Both are computed in closed form
+    (IPPE, Collins and Bartoli, IJCV 2014) and refined, unless the second fits the corners worse by a hundred
+    units of ``chi^2``. The better one counts; where they differ by more than 10 deg and by less than nine
+    units, the result is ``ambiguous``, and the one nearer to ``prior`` is taken.
 
     Args:
+        image: grey levels, ``(height, width)``.
         camera: the lens.
-        object_points: corners in the board frame, ``(n, 3)`` with ``z = 0`` [m].
-        image_points: where they were seen, ``(n, 2)`` [px].
+        board: the board whose pose is wanted.
+        markers: detected corners ``(4, 2)`` [px] by the marker's number; others than the board's are ignored.
         prior: rotation ``(3, 3)`` of the board that is to be expected.
 
     Returns:
-        The pose, or None where too few corners agree.
+        The pose with its covariance, or None where too few corners agree or too few edges can be seen.
     """
-    X, u = np.asarray(object_points, dtype=np.float64), np.asarray(image_points, dtype=np.float64)
+    starts = _from_corners(camera, board, markers)
+    found = [fit for start in starts if (fit := _fit(image, camera, board, *start)) is not None]
+    if not found:
+        return None
+    ambiguous = False
+    if len(found) == 2:
+        seen = [fit.residual[np.isfinite(fit.residual)] for fit in found]
+        variance = max(_EDGE_STD**2, min(float(np.median(r**2)) * 2.2 for r in seen)) * _CORRELATED
+        costs = [float(np.minimum(fit.residual**2 / variance, 9.0).sum()) for fit in found]
+        found = [found[k] for k in np.argsort(costs)]
+        apart = angle_between(found[0].rotation, found[1].rotation) > np.radians(10)
+        ambiguous = bool(apart and abs(costs[1] - costs[0]) < 9)
+        if ambiguous and prior is not None:
+            found.sort(key=lambda fit: angle_between(fit.rotation, prior))
+    best = found[0]
+    return BoardPose(best.rotation, best.position, best.covariance, ambiguous)
+
+
+def _from_corners(
+    camera: PinholeCamera, board: MarkerBoard, markers: Mapping[int, Array]
+) -> list[tuple[Array, Array]]:
+    """Rotation and position of one or both local minima; none where too few corners agree.
+
+    Corners farther than 1 px from the fit, or than four robust deviations, are left out, the worst first: a
+    corner half hidden by a finger is found, but at a wrong place.
+    """
+    seen = [k for k in board.ids if k in markers]
+    X = np.concatenate([board.corners[k - board.first_id] for k in seen])
+    u = np.concatenate([markers[k] for k in seen])
     while len(X) >= _MIN_CORNERS:
-        candidates = _both_poses(camera, X, u)
+        candidates = sorted(_both_poses(camera, X, u), key=lambda c: float(np.sum(c[2] ** 2)))
         if not candidates:
-            return None
-        best = candidates[0]
-        residual = np.linalg.norm(best[2], axis=1)
-        worst = int(residual.argmax())
+            break
+        residual = np.linalg.norm(candidates[0][2], axis=1)
         limit = min(_MAX_RESIDUAL, 4 * max(_CORNER_STD, float(np.median(residual))))
+        worst = int(residual.argmax())
         if residual[worst] <= limit:
-            return _choose(camera, X, candidates, prior)
-        keep = np.arange(len(X)) != worst
-        X, u = X[keep], u[keep]
-    return None
+            most = float(residual @ residual) + 100 * _CORNER_STD**2
+            return [(R, t) for R, t, r in candidates if float(np.sum(r**2)) <= most]
+        X, u = (np.delete(each, worst, axis=0) for each in (X, u))
+    return []
 
 
-def _both_poses(camera: PinholeCamera, X: Array, u: Array) -> list[tuple[Array, Array, Array]]:
-    """(rotation, position, residuals), the better fit first."""
+def _both_poses(camera: PinholeCamera, X: Array, u: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """Rotation, position and residuals of the local minima at which the board faces the camera."""
     cv2 = require("cv2")
-    K, distortion = camera.matrix, camera.distortion_array
+    lens = camera.matrix, camera.distortion_array
     try:
-        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(X, u[:, None], K, distortion, flags=cv2.SOLVEPNP_IPPE)
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(X, u[:, None], *lens, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error:  # collinear points
-        return []
-    found = []
-    for rvec, tvec in zip(rvecs, tvecs, strict=True):
-        rvec, tvec = cv2.solvePnPRefineLM(X, u[:, None], K, distortion, rvec, tvec)
+        return
+    for start in zip(rvecs, tvecs, strict=True):
+        rvec, tvec = cv2.solvePnPRefineLM(X, u[:, None], *lens, *start)
         rotation, position = cv2.Rodrigues(rvec)[0], tvec.ravel()
         seen = X @ rotation.T + position
-        # the printed side must face the camera, and be before it
         if np.all(np.isfinite(seen)) and np.all(seen[:, 2] > 0) and rotation[:, 2] @ position < 0:
-            found.append((rotation, position, u - camera.project(seen)))
-    return sorted(found, key=lambda c: float(np.sum(c[2] ** 2)))
+            yield rotation, position, u - camera.project(seen)
 
 
-def _choose(
-    camera: PinholeCamera, X: Array, candidates: list[tuple[Array, Array, Array]], prior: Array | None
-) -> BoardPose:
-    chosen, ambiguous, mirror = candidates[0], False, None
-    if len(candidates) > 1:
-        other = candidates[1]
-        worse = (np.sum(other[2] ** 2) - np.sum(chosen[2] ** 2)) / _CORNER_STD**2
-        if worse < 100 and angle_between(chosen[0], other[0]) > np.radians(2):
-            mirror = other[:2]
-        ambiguous = bool(worse < 9 and angle_between(chosen[0], other[0]) > np.radians(10))
-        if ambiguous and prior is not None:
-            nearer = angle_between(other[0], prior) < angle_between(chosen[0], prior)
-            chosen, mirror = (other, chosen[:2]) if nearer else (chosen, mirror)
-    rotation, position, residual = chosen
-    J = projection_jacobian(camera, X, rotation, position)
-    freedom = max(2 * len(X) - 6, 1)
-    variance = max(_CORNER_STD**2, float(np.sum(residual**2)) / freedom)
-    covariance = np.asarray(variance * np.linalg.inv(J.T @ J), dtype=np.float64)
-    return BoardPose(rotation, position, covariance, ambiguous, mirror)
+def _fit(
+    image: NDArray, camera: PinholeCamera, board: MarkerBoard, rotation: Array, position: Array
+) -> _Fit | None:
+    """Gauss-Newton from one start; None where there are too few edges, or those of something else."""
+    X, along = _side_points(board)
+    half_width = _half_width(camera, board, rotation, position)
+    first = camera.project(X @ rotation.T + position)
+    fit = None
+    for _ in range(_ITERATIONS):
+        J = projection_jacobian(camera, X, rotation, position)
+        # dpi/dx of the side's direction is the direction of its picture
+        direction = np.einsum("nij,nj->ni", J[:, :, :3], along @ rotation.T)
+        normal = np.stack([-direction[:, 1], direction[:, 0]], axis=-1)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        pixel = camera.project(X @ rotation.T + position)
+        offset, valid = _edge_offsets(image, pixel, normal, half_width)
+        if valid.sum() < 4 * _PER_SIDE or np.ptp(pixel[valid], axis=0).min() < 8:
+            return None
+        limit = 3 * max(_EDGE_STD, 1.4826 * float(np.median(np.abs(offset[valid]))))
+        used = valid & (np.abs(offset) <= limit)
+        rows = np.einsum("ni,nij->nj", normal[used], J[used])
+        step, *_ = np.linalg.lstsq(rows, offset[used], rcond=None)
+        rotation = require("cv2").Rodrigues(step[3:])[0] @ rotation
+        position = position + step[:3]
+        remaining = offset[used] - rows @ step
+        variance = _variance(remaining, np.flatnonzero(used) // _PER_SIDE)
+        covariance = np.asarray(variance * np.linalg.inv(rows.T @ rows))
+        fit = _Fit(rotation, position, covariance, np.where(valid, offset, np.inf))
+    moved = camera.project(X @ rotation.T + position) - first
+    return fit if float(np.abs(moved).max()) < _REACH else None
+
+
+def _variance(residual: Array, side: NDArray[np.int_]) -> float:
+    """Of one sample as if all were independent [px^2].
+
+    They are not: light, blur and the raster shift all edges of a side together. What counts is how the
+    means of sides scatter, ``sum_s n_s m_s^2 / (n_sides - 6)``, and never less than three times the
+    variance of single samples.
+    """
+    count = np.bincount(side)
+    mean = np.bincount(side, residual)[count > 0] / count[count > 0]
+    freedom = len(mean) - 6
+    between = float(count[count > 0] @ mean**2) / freedom if freedom > 1 else 0.0
+    single = float(residual @ residual) / max(len(residual) - 6, 1)
+    return max(_CORRELATED * max(_EDGE_STD**2, single), between)
+
+
+def _side_points(board: MarkerBoard) -> tuple[Array, Array]:
+    """Points on all sides and the sides' directions in the board frame, ``(n, 3)`` each.
+
+    In the order of the corners (clockwise seen from before), so that white lies to the left.
+    """
+    start = board.corners.reshape(-1, 3)
+    end = np.roll(board.corners, -1, axis=1).reshape(-1, 3)
+    fraction = np.linspace(0.12, 0.88, _PER_SIDE)[None, :, None]
+    points = start[:, None] * (1 - fraction) + end[:, None] * fraction
+    return points.reshape(-1, 3), np.repeat(end - start, _PER_SIDE, axis=0)
+
+
+def _half_width(camera: PinholeCamera, board: MarkerBoard, rotation: Array, position: Array) -> float:
+    """How far to look across an edge [px]: half of the black rim or of the gap, seen askew.
+
+    Farther out, the blurred bits and neighbours would draw the edge towards themselves. Too narrow a
+    look that ends on the slope is harmless: it is cut off alike on both sides.
+    """
+    cells = 6.0  # of a marker of 4 x 4 bits and its rim; finer dictionaries come out a little narrower
+    cosine = abs(rotation[:, 2] @ position) / np.linalg.norm(position)
+    narrowest = min(board.marker_size / cells, board.gap, board.margin)
+    width = 0.5 * narrowest * camera.fx / position[2] * max(float(cosine), 0.5)
+    return float(np.clip(width, 1.0, 3.0))
+
+
+def _edge_offsets(
+    image: NDArray[np.uint8], pixel: Array, normal: Array, half_width: float
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Signed distance of the edge from ``pixel`` along ``normal`` [px], and whether there is one."""
+    n_half = max(2, round(half_width / _STEP))
+    s = _STEP * np.arange(-n_half, n_half + 1)
+    where = (pixel[:, None] + s[:, None] * normal[:, None]).astype(np.float32)
+    profile = require("cv2").remap(image, where, None, 1).astype(np.float64)  # 1: bilinear
+    sides = profile.reshape(-1, _PER_SIDE, len(s))
+    # levels: of each side, so that the noise of a pixel does not move the edge
+    left = np.median(sides[:, :, -2:], axis=(1, 2)).repeat(_PER_SIDE)
+    right = np.median(sides[:, :, :2], axis=(1, 2)).repeat(_PER_SIDE)
+    contrast = left - right  # n = (-d_v, d_u)
+    white, black = np.median(left), np.median(right)
+    typical = white - black
+    safe = np.where(np.abs(contrast) > 1, contrast, 1.0)
+    share = (profile - right[:, None]) / safe[:, None]
+    offset = s[-1] - _STEP * (share.sum(axis=1) - 0.5 * (share[:, 0] + share[:, -1]))
+    height, width = image.shape
+    inside = np.all((where > 0) & (where < [width - 1, height - 1]), axis=(1, 2))
+    tolerance = 0.25 * abs(typical)
+    valid = (
+        inside
+        & (np.sign(contrast) == np.sign(typical))
+        & (np.abs(left - white) < tolerance)
+        & (np.abs(right - black) < tolerance)
+        & (np.abs(profile[:, -2:].mean(1) - left) < tolerance)
+        & (np.abs(profile[:, :2].mean(1) - right) < tolerance)
+        & (np.abs(offset) < 0.6 * s[-1])
+    )
+    return offset, valid
 
 
 def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, position: Array) -> Array:
-    """``du = (dpi/dx) (dt - [R X]x dphi)`` for ``R+ = exp([dphi]x) R``: ``(2 n, 6)``, columns (v; w)."""
+    """``du = (dpi/dx) (dt - [R X]x dphi)`` for ``R+ = exp([dphi]x) R``: ``(n, 2, 6)``, columns (v; w)."""
     cv2 = require("cv2")
     rvec = cv2.Rodrigues(rotation)[0]
     _, full = cv2.projectPoints(X, rvec, position, camera.matrix, camera.distortion_array)
     by_position = full[:, 3:6].reshape(-1, 2, 3)  # dpi/dx, since x = R X + t
     by_rotation = -by_position @ hat(torch.from_numpy(X @ rotation.T)).numpy()
-    return np.concatenate([by_position, by_rotation], axis=-1).reshape(-1, 6)
+    return np.concatenate([by_position, by_rotation], axis=-1)
 
 
 def angle_between(a: Array, b: Array) -> float:

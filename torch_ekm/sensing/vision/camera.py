@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..._extras import require
 from ...exceptions import ParameterError
 from ...typing import Array
 
@@ -46,11 +47,7 @@ class PinholeCamera:
 
     def project(self, points: Array) -> Array:
         """Pixels ``(*batch, 2)`` of points ``(*batch, 3)`` in the camera frame [m], ``z > 0``."""
-        points = np.asarray(points, dtype=np.float64)
-        x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
-        k1, k2, p1, p2, k3 = self.distortion
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        return np.stack([self.fx * xd + self.cx, self.fy * yd + self.cy], axis=-1)
+        flat = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        lens = self.matrix, self.distortion_array
+        pixels, _ = require("cv2").projectPoints(flat, np.zeros(3), np.zeros(3), *lens)
+        return pixels.reshape(*np.shape(points)[:-1], 2)

@@ -11,7 +11,6 @@ from ...typing import Array
 from .board import MarkerBoard, get_dictionary
 from .board_pose import BoardPose, angle_between, estimate_board_pose
 from .camera import PinholeCamera
-from .edge_refinement import refine_on_edges
 from .track import Track, TrackStatus
 
 _MAX_STEP, _MAX_TURN = 0.020, float(np.radians(20.0))  # believable between two frames [m], [rad]
@@ -34,22 +33,18 @@ class MarkerTracker:
         palm_board: its ``mount`` is its pose in the hand frame.
         object_board: its ``mount`` is its pose in the object's frame
             (``ObjectDescription.marker_transform``).
-        edges: refine each board's pose on the edges of its markers: more accurate, and slower.
 
     Raises:
         ParameterError: the two boards share markers, or are of different dictionaries.
     """
 
-    def __init__(
-        self, camera: PinholeCamera, palm_board: MarkerBoard, object_board: MarkerBoard, edges: bool = True
-    ) -> None:
+    def __init__(self, camera: PinholeCamera, palm_board: MarkerBoard, object_board: MarkerBoard) -> None:
         if set(palm_board.ids) & set(object_board.ids):
             valid = f"beyond the palm's {palm_board.ids}"
             raise ParameterError("object_board.first_id", object_board.first_id, valid)
         if palm_board.dictionary != object_board.dictionary:
             raise ParameterError("object_board.dictionary", object_board.dictionary, palm_board.dictionary)
         self.camera, self.palm_board, self.object_board = camera, palm_board, object_board
-        self.edges = edges
         self._detector = _make_detector(palm_board.dictionary)
         self.reset()
 
@@ -69,25 +64,25 @@ class MarkerTracker:
             return Track(TrackStatus.NO_IMAGE)
         grey = self._grey(image)
         markers = self._detect(grey)
-        palm, obj = (self._board_pose(b, markers, grey) for b in (self.palm_board, self.object_board))
-        ids = (*self.palm_board.ids, *self.object_board.ids)
-        markers = {k: corners for k, corners in markers.items() if k in ids}
+        boards = self.palm_board, self.object_board
+        palm, obj = poses = [self._board_pose(board, markers, grey) for board in boards]
+        markers = {k: corners for k, corners in markers.items() if any(k in board.ids for board in boards)}
 
         def failed(status: TrackStatus) -> Track:
             return Track(status, palm=palm, object=obj, markers=markers)
 
-        if palm is None:
-            return failed(TrackStatus.PALM_HIDDEN)
-        if not self._certain(self.palm_board, palm):
-            return failed(TrackStatus.AMBIGUOUS)
-        if obj is None:
-            return failed(TrackStatus.OBJECT_HIDDEN)
-        if not self._certain(self.object_board, obj):
-            return failed(TrackStatus.AMBIGUOUS)
-        position, rotation, covariance = self._object_in_hand(palm, obj)
+        seen: list[BoardPose] = []
+        hidden = TrackStatus.PALM_HIDDEN, TrackStatus.OBJECT_HIDDEN
+        for board, pose, unseen in zip(boards, poses, hidden, strict=True):
+            if pose is None:
+                return failed(unseen)
+            if pose.ambiguous and id(board) not in self._prior:
+                return failed(TrackStatus.AMBIGUOUS)
+            seen.append(pose)
+        position, rotation, covariance = self._object_in_hand(*seen)
         if not self._believable(position, rotation):
             return failed(TrackStatus.JUMP)
-        self._prior = {id(self.object_board): obj.rotation, id(self.palm_board): palm.rotation}
+        self._prior = {id(board): pose.rotation for board, pose in zip(boards, seen, strict=True)}
         tensors = (torch.from_numpy(array) for array in (position, rotation, covariance))
         return Track(TrackStatus.OK, *tensors, palm=palm, object=obj, markers=markers)
 
@@ -108,21 +103,9 @@ class MarkerTracker:
         return {k: corners[i].reshape(4, 2).astype(np.float64) for i, k in once}
 
     def _board_pose(self, board: MarkerBoard, markers: dict[int, Array], grey: NDArray) -> BoardPose | None:
-        seen = [k for k in board.ids if k in markers]
-        if len(seen) < min(_MIN_MARKERS, board.n_markers):
+        if sum(k in markers for k in board.ids) < min(_MIN_MARKERS, board.n_markers):
             return None
-        pose = estimate_board_pose(
-            self.camera,
-            np.concatenate([board.corners[k - board.first_id] for k in seen]),
-            np.concatenate([markers[k] for k in seen]),
-            self._prior.get(id(board)),
-        )
-        if pose is None or not self.edges:
-            return pose
-        return refine_on_edges(grey, self.camera, board, pose, prior=self._prior.get(id(board)))
-
-    def _certain(self, board: MarkerBoard, pose: BoardPose) -> bool:
-        return not pose.ambiguous or id(board) in self._prior
+        return estimate_board_pose(grey, self.camera, board, markers, self._prior.get(id(board)))
 
     def _object_in_hand(self, palm: BoardPose, obj: BoardPose) -> tuple[Array, Array, Array]:
         """Position, rotation and covariance of the object's frame in the hand frame."""
@@ -142,21 +125,19 @@ class MarkerTracker:
 
     def _believable(self, position: Array, rotation: Array) -> bool:
         """Near the last pose, or near a jump that the last frames agreed on."""
-        if self._last is None or self._near(self._last, position, rotation):
-            self._jumps.clear()
-        else:
-            if self._jumps and not self._near(self._jumps[-1], position, rotation):
-                self._jumps.clear()
-            self._jumps.append((position, rotation))
+        here = position, rotation
+        if self._last is not None and not _near(self._last, here):
+            agree = bool(self._jumps) and _near(self._jumps[-1], here)
+            self._jumps = [*self._jumps, here] if agree else [here]
             if len(self._jumps) < _JUMP_FRAMES:
                 return False
-            self._jumps.clear()
-        self._last = (position, rotation)
+        self._jumps, self._last = [], here
         return True
 
-    def _near(self, other: tuple[Array, Array], position: Array, rotation: Array) -> bool:
-        turn, step = angle_between(rotation, other[1]), np.linalg.norm(position - other[0])
-        return bool(step <= _MAX_STEP and turn <= _MAX_TURN)
+
+def _near(one: tuple[Array, Array], other: tuple[Array, Array]) -> bool:
+    turn, step = angle_between(one[1], other[1]), np.linalg.norm(one[0] - other[0])
+    return bool(step <= _MAX_STEP and turn <= _MAX_TURN)
 
 
 def _make_detector(dictionary: str):

@@ -133,15 +133,6 @@ class Transmission:
         """Series stiffness k_a of each actuator, ``(n_a,)`` [N m/rad]."""
         return self._k[: self.n_a]
 
-    @property
-    def origin(self) -> Array:
-        """``a0``, and what followers add by their rest: the joints that lead see the motor minus it."""
-        return self.offset + self._followed
-
-    def parts(self) -> Iterator[tuple[Array, float, bool]]:
-        """Actuators, then couplings: moment arms ``(n_q,)``, stiffness [N m/rad], whether it only pulls."""
-        return zip(self._M, self._k.tolist(), self._pulls_only.tolist(), strict=True)
-
     def relax(self, q: Array) -> None:
         """Put the friction's anchors at ``q``: no friction torque, no hysteresis, joints amid their play."""
         self._anchor = np.array(q, dtype=np.float64)
@@ -151,7 +142,7 @@ class Transmission:
     def stretch(self, q: Array, motor: Array) -> Array:
         """``m - a0 - J_a q``: elastic stretch of each transmission [rad]; negative: a tendon is slack."""
         if self._lengths is None:
-            return motor - self.origin - self._lead @ self.shape.excursion(q)
+            return motor - self.offset - self._followed - self._lead @ self.shape.excursion(q)
         return motor - self.offset - self._lengths.length(self._leading(q), self.J_a)
 
     def actuator_torque(self, q: Array, motor: Array) -> Array:

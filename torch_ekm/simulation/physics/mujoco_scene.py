@@ -10,10 +10,8 @@ from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...typing import Array
-from ..mechanism.transmission import Transmission
 from .links import ARMATURE, JOINT_DAMPING, moving_links, principal
 
-_STRONGEST = 1e6  # [N m] of a tendon that only pulls; a limit that never acts
 _FIXED = 1e6  # [kg] and [kg m^2] added to an object that is held
 _LEAST_MASS, _LEAST_INERTIA = 1e-6, 1e-10  # of links without mass: MuJoCo takes no zeros
 _NARROW = 1e-6  # [rad] between the limits of a joint that cannot move
@@ -32,18 +30,10 @@ class MujocoScene:
         obj: the object, as it really is.
         time_step: [s].
         contact_stiffness: of each contact [N/m]; 0: as stiff as the time step allows.
-        native: its tendons, springs and couplings become MuJoCo's own, without friction and what else it does
-            not have; :meth:`step` then takes ``m - a0`` ``(n_a,)`` [rad], and joints keep of their drives the
-            damping alone. None: joints have drives.
     """
 
     def __init__(
-        self,
-        hand: HandDescription,
-        obj: ObjectDescription,
-        time_step: float,
-        contact_stiffness: float = 0.0,
-        native: Transmission | None = None,
+        self, hand: HandDescription, obj: ObjectDescription, time_step: float, contact_stiffness: float
     ) -> None:
         self._mj: Any = require("mujoco")
         self.time_step = time_step
@@ -56,9 +46,6 @@ class MujocoScene:
         option.integrator = self._mj.mjtIntegrator.mjINT_IMPLICITFAST
         option.impratio, option.noslip_iterations, option.tolerance = 1000.0, 20, 1e-10  # else contacts creep
         link_of = self._add_hand(spec, hand)
-        if native is not None:
-            self._add_tendons(spec, hand, native)
-        self._native = native is not None
         shapes = self._add_object(spec, hand, obj)
         for geom in link_of:
             for shape in shapes:
@@ -96,27 +83,6 @@ class MujocoScene:
                 link_of[geom] = name
                 self._add_shape(body, geom, at, shape)
         return link_of
-
-    def _add_tendons(self, spec: Any, hand: HandDescription, native: Transmission) -> None:
-        for name, stiffness, rest in zip(
-            hand.joint_names, native.spring_stiffness, native.spring_rest, strict=True
-        ):
-            joint = spec.joint(name)
-            joint.stiffness[0], joint.springref = stiffness, rest
-        for k, (row, stiffness, pulls_only) in enumerate(native.parts()):
-            tendon = spec.add_tendon(name=f"tendon/{k}")
-            for name, arm in zip(hand.joint_names, row, strict=True):
-                if arm != 0:
-                    tendon.wrap_joint(name, arm)
-            if k >= hand.n_a:  # a coupling
-                tendon.stiffness[0], tendon.springlength = stiffness, 2 * [float(row @ native.spring_rest)]
-                continue
-            actuator = spec.add_actuator(
-                name=hand.actuators[k].name, target=tendon.name, trntype=self._mj.mjtTrn.mjTRN_TENDON
-            )
-            actuator.gainprm[0], actuator.biastype = stiffness, self._mj.mjtBias.mjBIAS_AFFINE
-            actuator.biasprm[1] = -stiffness
-            actuator.forcelimited, actuator.forcerange = pulls_only, [0.0, _STRONGEST]
 
     def _add_object(self, spec: Any, hand: HandDescription, obj: ObjectDescription) -> list[str]:
         """Names of its geoms. A planar hand's object neither leaves the plane nor tilts out of it."""
@@ -263,10 +229,7 @@ class MujocoScene:
 
     def step(self, drive_targets: Array) -> None:
         data = self._data
-        if self._native:
-            data.ctrl[:] = drive_targets
-        else:
-            data.qfrc_applied[self._v] = self._stiffness * (drive_targets - data.qpos[self._q])
+        data.qfrc_applied[self._v] = self._stiffness * (drive_targets - data.qpos[self._q])
         self._mj.mj_step(self._model, data)
         data.xfrc_applied[self._body] = 0.0
         if self._held is not None:

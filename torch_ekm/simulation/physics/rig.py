@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from ..config import PlantConfig
 from ..grasp_planning.pinch import PinchPlan, opposing_pads
 from ..mechanism.assembly import chain, make_transmission, true_object
 from ..mechanism.servo import Servo
-from ..mechanism.transmission import Transmission
 from ..parameters import PlantParameters
 from ..sensors import TimedState
 from .scene import make_scene
@@ -28,18 +27,6 @@ _FURTHER = 0.5  # longest further wait for a still object [s]
 _CLOSING, _HOLDING, _SETTLING = 0.2, 0.3, 1.0  # [s] of a grasp, object held fixed in the first two
 
 
-class RigState(NamedTuple):
-    """All that changes in a :class:`Rig`, for :meth:`Rig.restore`; SI units, hand frame."""
-
-    physics: bytes
-    transmission: Transmission
-    servo: Servo
-    parameters: PlantParameters
-    normal: Array
-    fingers: int
-    time: float
-
-
 class Rig:
     """Steps the scene with the transmission's torques while the servos move, and measures the contact forces.
 
@@ -49,7 +36,6 @@ class Rig:
         parameters: what they really are.
         remember: called every 0.01 s if the camera is late.
         engine: which physics, one of :data:`ENGINES`.
-        native: the engine runs the tendons, which change no more.
     """
 
     def __init__(
@@ -59,11 +45,10 @@ class Rig:
         config: PlantConfig,
         parameters: PlantParameters,
         remember: Callable[[TimedState], None],
-        engine: str = "sapien",
-        native: bool = False,
+        engine: str,
     ) -> None:
         self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
-        self.remember, self.engine, self.native = remember, engine, native
+        self.remember, self.engine = remember, engine
         self.transmission = make_transmission(hand, parameters)
         self.servo = Servo(
             hand.actuator_lower, hand.actuator_upper, parameters, config.relative_to, hand.actuator_backlash
@@ -80,9 +65,7 @@ class Rig:
     def _build(self) -> None:
         p = self.parameters
         obj, step = true_object(self.obj, p), self.config.time_step
-        self.scene = make_scene(
-            self.engine, self.hand, obj, step, p.contact_stiffness, self.transmission if self.native else None
-        )
+        self.scene = make_scene(self.engine, self.hand, obj, step, p.contact_stiffness)
         thumb, _ = opposing_pads(self.hand, self.config)
         pad = next(pad.link for pad in self.hand.pads if pad.name == thumb)
         finger = self._finger_of.get(pad)  # None: a part of the palm
@@ -177,11 +160,8 @@ class Rig:
             output = servo.move_to(motor_at(k / steps))
             if push is not None:
                 scene.push(*push)
-            if self.native:
-                scene.step(output - transmission.origin)
-            else:
-                q = scene.next_q if transmission.stiff else scene.q
-                scene.step(transmission.drive_targets(q, output))
+            q = scene.next_q if transmission.stiff else scene.q
+            scene.step(transmission.drive_targets(q, output))
             if self.parameters.latency > 0 and (begun + k) % often == 0:
                 self.remember(self.state._replace(time=self.time + k * self.config.time_step))
             if k > steps - window:
@@ -202,7 +182,7 @@ class Rig:
         """
         old, self.parameters = self.parameters, new
         self.servo.set_parameters(new)
-        if changes_transmission(old, new):
+        if _differ(old, new, *_TRANSMISSION):
             previous, self.transmission = self.transmission, make_transmission(self.hand, new)
             self.transmission.take_over(previous, self.scene.q, self.servo.output)
             self.scene.set_drive_stiffness(self.transmission.drive_stiffness)
@@ -224,35 +204,24 @@ class Rig:
             sides.reverse()
         self.scene.set_friction(sides[0], sides[1])
 
-    def snapshot(self) -> RigState:
-        return RigState(
-            self.scene.snapshot(),
-            copy.deepcopy(self.transmission),
-            copy.deepcopy(self.servo),
-            self.parameters,
-            self.normal.copy(),
-            self.fingers,
-            self.time,
-        )
+    def snapshot(self) -> tuple[bytes, dict[str, Any]]:
+        """All that changes, for :meth:`restore`: of the physics, and of the rest by name."""
+        return self.scene.snapshot(), copy.deepcopy({name: getattr(self, name) for name in _CHANGING})
 
-    def restore(self, state: RigState) -> None:
+    def restore(self, state: tuple[bytes, dict[str, Any]]) -> None:
         """Go back to ``state``, taken with the parameters that hold now."""
-        if self._built_scale != state.parameters.object_scale:
+        if self._built_scale != self.parameters.object_scale:
             self._build()
-        self.scene.restore(state.physics)
-        self.transmission, self.servo = copy.deepcopy((state.transmission, state.servo))
-        self.normal, self.fingers, self.time = state.normal.copy(), state.fingers, state.time
+        physics, rest = state
+        self.scene.restore(physics)
+        vars(self).update(copy.deepcopy(rest))
 
 
+_CHANGING = ("transmission", "servo", "normal", "fingers", "time")
 _TRANSMISSION = (
     "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase",
     "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed",
 )  # fmt: skip
-
-
-def changes_transmission(old: PlantParameters, new: PlantParameters) -> bool:
-    """Whether tendons, springs or joints become others."""
-    return _differ(old, new, *_TRANSMISSION)
 
 
 def _differ(old: PlantParameters, new: PlantParameters, *names: str) -> bool:

@@ -27,7 +27,7 @@ class SapienScene:
     """
 
     def __init__(
-        self, hand: HandDescription, obj: ObjectDescription, time_step: float, contact_stiffness: float = 0.0
+        self, hand: HandDescription, obj: ObjectDescription, time_step: float, contact_stiffness: float
     ) -> None:
         self.time_step = time_step
         self._scene: Any = new_scene(hand.gravity, time_step)

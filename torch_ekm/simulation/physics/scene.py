@@ -6,7 +6,6 @@ from typing import Protocol
 
 from ...description import HandDescription, ObjectDescription
 from ...typing import Array
-from ..mechanism.transmission import Transmission
 
 ENGINES = {"sapien": "SAPIEN", "mujoco": "MuJoCo"}
 """The physics that there are, by name, and what they are called."""
@@ -88,11 +87,8 @@ def make_scene(
     obj: ObjectDescription,
     time_step: float,
     contact_stiffness: float,
-    native: Transmission | None = None,
 ) -> Scene:
     """The scene of an engine, ``contact_stiffness`` [N/m] of each contact, 0: as rigid as the engine has it.
-
-    ``native``: tendons for MuJoCo to run, as :class:`~.mujoco_scene.MujocoScene` takes it.
 
     Raises:
         MissingExtraError: it is not installed.
@@ -104,4 +100,4 @@ def make_scene(
         return SapienScene(hand, obj, time_step, contact_stiffness)
     from .mujoco_scene import MujocoScene
 
-    return MujocoScene(hand, obj, time_step, contact_stiffness, native)
+    return MujocoScene(hand, obj, time_step, contact_stiffness)

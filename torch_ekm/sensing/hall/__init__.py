@@ -1,1 +1,0 @@
-"""Hall readings: calibration and joint angles."""
