@@ -8,28 +8,21 @@ on: drawn at random, or a variation of the fault that has brought the largest co
 session what is known of the hand is nonsense to begin with. No command may exceed ``Guards.increment``, none
 may be anything but finite and within the range by the reading it starts from, and nothing may be learned from
 a reading that the guards refuse.
-
-Then turns are killed (SIGKILL) at random moments, and gone on with in another process.
 """
 
 from __future__ import annotations
 
 import argparse
 import concurrent.futures
-import contextlib
 import functools
 import itertools
 import math
 import os
-import signal
-import tempfile
-import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -40,7 +33,6 @@ from torch_ekm.control import (
     ClosedLoop,
     Guards,
     HandKnowledge,
-    Journal,
     LookAndMoveController,
     OneStep,
     PoseTarget,
@@ -48,7 +40,6 @@ from torch_ekm.control import (
 )
 from torch_ekm.control.safety.readings import ReadingTests
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import EKMError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
@@ -309,91 +300,12 @@ def search(
         return sum(pool.map(part, seeds, itertools.repeat(each), itertools.repeat(grips)), Count())
 
 
-class Hardware(Obedient):
-    """A hand that stands where it stood, whatever happens to the process that drives it."""
-
-    def __init__(self, model: KinematicModel, seen: Observation, folder: Path) -> None:
-        self._file = folder / "hand.pt"
-        if self._file.exists():
-            *known, seconds = torch.load(self._file)
-            q, a, position, rotation, force = known
-            seen = replace(seen, q=q, a=a, position=position, rotation=rotation, fingertip_force=force)
-            seen = replace(seen, time=seconds)
-        super().__init__(model, seen)
-
-    def command(self, delta_a: torch.Tensor) -> Observation:
-        seen = super().command(delta_a)
-        state, part = self.state, self._file.with_suffix(".part")
-        torch.save([state.q, self.a, state.position, state.rotation, self.force, seen.time], part)
-        part.replace(self._file)
-        return seen
-
-
-def killed(held, moment: float, learns: bool, folder: Path) -> tuple[int, str]:
-    """A turn, killed ``moment`` [s] after it began and resumed: motions until then, and what came of it.
-
-    Raises:
-        AssertionError: the files are not whole, or what was learned until the last motion is not there.
-    """
-    seen, axis, model = held
-
-    def made() -> ClosedLoop:
-        chosen = EnhancedModel.for_grasp(model, seen.state) if learns else model
-        knowledge = HandKnowledge.of(model.hand)
-        return ClosedLoop(
-            Hardware(model, seen, folder), LookAndMoveController(chosen, axis), knowledge=knowledge
-        )
-
-    journal, target = Journal(folder / "turn.ekm"), PoseTarget.turned(seen.state, axis, degrees=20)
-    child = os.fork()
-    if child == 0:
-        with contextlib.suppress(BaseException):
-            journal.run(made(), target)
-        os._exit(0)
-    while not journal.path.exists():
-        time.sleep(0.002)
-    time.sleep(moment)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    if not journal.cut_short:
-        return 0, "at its end"
-    written, loop = journal._read(), made()
-    forgotten = loop.knowledge.servo.weight.clone()
-    try:
-        result = journal.resume(loop)
-    except EKMError as error:
-        return written["motions"], type(error).__name__
-    if written["motions"] and learns:
-        assert not torch.equal(written["learned"]["knowledge"]["servo.weight"], forgotten), "nothing was kept"
-    assert not bool(loop.plant.given[0].any()), "it does not hold first"
-    assert (
-        float(result.steps[0].before.a.sub(loop.plant.true[0]).abs().max()) == 0.0 if result.steps else True
-    )
-    return written["motions"], result.reason.value
-
-
-def kills(n: int, seed: int = 0) -> Counter[str]:
-    """What came of ``n`` turns that were killed at random moments."""
-    held, draw, ends = grasp("icub_right", "box"), np.random.default_rng(seed), Counter[str]()
-    for k in range(n):
-        with tempfile.TemporaryDirectory() as folder:
-            ends[killed(held, draw.uniform(0.0, 0.6), k % 2 == 0, Path(folder))[1]] += 1
-    return ends
-
-
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--readings", type=int, default=100_000)
     arguments.add_argument("--seed", type=int, default=1000, help="of the first session")
-    arguments.add_argument("--kills", type=int, default=50)
     options = arguments.parse_args()
-    torch.set_num_threads(1)
-    warnings.simplefilter("ignore")
     count = search(options.readings, seed=options.seed)
-    ends = kills(options.kills, options.seed)
-    right = sum(ends[end] for end in ("reached", "at its end", "ResumeError"))
-    said = ", ".join(f"{n} {reason}" for reason, n in ends.most_common())
-    print(f"turns killed {options.kills}, resumed or refused as they should be {right}: {said}")
     print(f"turns ended {', '.join(f'{n} {reason}' for reason, n in count.reasons.most_common())}")
     print(f"largest command {count.largest / DEG:.2f} deg, set-points beyond the range {count.outside}")
     print(count)

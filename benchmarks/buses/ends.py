@@ -11,6 +11,7 @@ and what a driver needs to find it; then a line of JSON for each line:
     fault KIND        of ROS 2's messages: nan, name, short, old; nothing: none
     pull closed|silent    the cable: connections close, or nothing comes through any more
     plug              back again, and where
+    mark NUMBER       the number: what comes after it answers no earlier question
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ from yarp_text import answer
 
 from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import SimulatedHand
+
+_LATE = 0.2  # [s] within which a busy machine obeys what was sent without an answer
 
 
 class Dynamixel:
@@ -303,6 +306,8 @@ class End:
 
     def answer(self, line: str) -> Any:
         word, _, rest = line.partition(" ")
+        if word in ("reset", "mark"):
+            time.sleep(_LATE)  # what was sent before is obeyed before
         if word == "reset" and self.hand is not None:
             self.hand.reset(int(rest))
         elif word == "goals":
@@ -316,6 +321,8 @@ class End:
             self.wire.fault = rest
         elif word == "pull":
             self.wire.pull(rest == "silent")
+        elif word == "mark":
+            return {"mark": int(rest)}
         elif word == "plug":
             self.wire.plug()
             return self.wire.place
