@@ -18,6 +18,7 @@ import functools
 import itertools
 import math
 import os
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Iterator
@@ -295,9 +296,12 @@ def search(
     readings: int, each: int = 500, seed: int = 0, grips: tuple[tuple[str, str], ...] = GRASPS
 ) -> Count:
     """Sessions of ``each`` readings until there were so many; E-KM and KM+S in turn."""
-    seeds = range(seed, seed + -(-readings // each))
+    seeds, count = range(seed, seed + -(-readings // each)), Count()
     with concurrent.futures.ProcessPoolExecutor(min(os.cpu_count() or 1, len(seeds))) as pool:
-        return sum(pool.map(part, seeds, itertools.repeat(each), itertools.repeat(grips)), Count())
+        for one in pool.map(part, seeds, itertools.repeat(each), itertools.repeat(grips)):
+            count = count + one
+            print(count, file=sys.stderr, flush=True)
+    return count
 
 
 def main() -> None:
