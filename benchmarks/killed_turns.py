@@ -265,8 +265,12 @@ def kills(kind: str, n: int, seed: int = 0, python: str = sys.executable) -> Cou
                 held.loop(plant, seen, True).run(held.target(seen))
                 longest = time.monotonic() - began
         for k in range(n):
+            moment = draw.uniform(0.0, 1.0)
             with tempfile.TemporaryDirectory() as folder:
-                motions, end = killed(held, draw.uniform(0.0, 1.0), k % 2 == 0, Path(folder), longest)
+                try:
+                    motions, end = killed(held, moment, k % 2 == 0, Path(folder), longest)
+                except AssertionError as error:
+                    motions, end = -1, str(error)
             ends[end] += 1
             print(f"{kind} {k}: after {motions} motions, {end}", file=sys.stderr, flush=True)
     return ends

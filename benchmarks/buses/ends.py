@@ -40,8 +40,6 @@ from yarp_text import answer
 from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import SimulatedHand
 
-_LATE = 0.2  # [s] within which a busy machine obeys what was sent without an answer
-
 
 class Dynamixel:
     """Servos behind a pseudo terminal; the genuine SDK is the client."""
@@ -61,6 +59,9 @@ class Dynamixel:
 
     def spoil(self, spoiler: Spoiler) -> None:
         self.bus.spoil = spoiler
+
+    def catch_up(self) -> None:
+        self.bus.catch_up()
 
     def pull(self, silent: bool) -> None:
         if silent:
@@ -143,6 +144,9 @@ class Ros2:
 
     def spoil(self, spoiler: Spoiler) -> None:
         self.spoiler = spoiler
+
+    def catch_up(self) -> None:
+        time.sleep(0.2)  # of discovery and transport nothing is known
 
     def pull(self, silent: bool) -> None:
         if silent:
@@ -261,6 +265,9 @@ class Yarp:
     def spoil(self, spoiler: Spoiler) -> None:
         self._spoiler = spoiler
 
+    def catch_up(self) -> None:
+        time.sleep(0.2)  # the board answers when it has obeyed; the cable may still hold something
+
     def pull(self, silent: bool) -> None:
         if silent:
             self._silent = True
@@ -307,7 +314,7 @@ class End:
     def answer(self, line: str) -> Any:
         word, _, rest = line.partition(" ")
         if word in ("reset", "mark"):
-            time.sleep(_LATE)  # what was sent before is obeyed before
+            self.wire.catch_up()  # what was sent before is obeyed before
         if word == "reset" and self.hand is not None:
             self.hand.reset(int(rest))
         elif word == "goals":
