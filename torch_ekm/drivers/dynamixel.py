@@ -17,6 +17,7 @@ from .servos import SERVOS, Servo
 _TURN = 4096
 _TICKS = _TURN / (2 * math.pi)  # per rad
 _VELOCITY = 0.229 * 2 * math.pi / 60  # [rad/s] of a unit of Profile Velocity
+_PWM = 0.113  # [%] of a unit of Goal PWM
 _WATCHDOG_MS = 80
 _LAST_ID = 252
 # control table of the X series: (address, bytes)
@@ -175,16 +176,15 @@ class DynamixelPlant(HandDriver):
     def _able_to_move(self, current_ma: float) -> None:
         """Another program may have left a servo without voltage or current; less than all is said."""
         for one, model, found in zip(self.wiring.motors, self._models, self._found, strict=True):
-            powers = [("Goal PWM", "PWM Limit", 0.113, "%")]
-            if found["Operating Mode"] == 5:
-                powers.append(("Goal Current", "Current Limit", model.unit_ma, "mA"))
-            for goal, limit, unit, name in powers:
-                least = min((goal, limit), key=found.__getitem__)
-                if found[least] == 0:
+            powers = [("PWM", _PWM, "%"), ("Current", model.unit_ma, "mA")]
+            for power, unit, name in powers if found["Operating Mode"] == 5 else powers[:1]:
+                goal, limit = found[f"Goal {power}"], found[f"{power} Limit"]
+                if not min(goal, limit):
                     remedy = "restore it with the maker's tool, or switch the servo off and on"
-                    raise self.wiring.error("motors", one, f"its {least} is 0, it cannot move: {remedy}")
-                if found[goal] < found[limit] and not (current_ma and name == "mA"):
-                    shown = f"{goal} is {found[goal] * unit:.4g} {name} of {found[limit] * unit:.4g} {name}"
+                    problem = f"its Goal {power} or {power} Limit is 0, it cannot move: {remedy}"
+                    raise self.wiring.error("motors", one, problem)
+                if goal < limit and not (current_ma and power == "Current"):
+                    shown = f"Goal {power} is {goal * unit:.4g} {name} of {limit * unit:.4g} {name}"
                     self.notes.append(f"motor '{one.name}': {shown}, as another program left it")
 
     def _prepare(self, mode: int, current_ma: float) -> None:

@@ -173,20 +173,19 @@ def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
 def _held(
     time: Array, runs: Numbers, at: Array, run: Numbers, given: Array, places: tuple[Numbers, Numbers] | None
 ) -> tuple[Array, Array]:
-    """Of each row the newest value of its run, and its age; NaN: there is none, or it is too old.
+    """Of each row the newest value of its run, by times or by ``places`` of rows and values; and its age.
 
-    Args:
-        places: of rows and values in one order, that counts in place of times; None: times count.
+    NaN: there is none, or it is too old.
     """
-    key, mine_at = (time, at) if places is None else places
-    order = np.lexsort((mine_at, run))
-    at, mine_at, run, given = at[order], mine_at[order], run[order], given[order]
+    key, place = (time, at) if places is None else places
+    order = np.lexsort((place, run))
+    at, place, run, given = at[order], place[order], run[order], given[order]
     steps = np.diff(at)[np.diff(run) == 0]
     most = _HELD * steps.mean() if len(steps) > 1 else np.inf
     value, age = np.full(len(time), np.nan), np.full(len(time), np.nan)
     for one in np.unique(run):
         mine, rows = run == one, np.flatnonzero(runs == one)
-        last = np.searchsorted(mine_at[mine], key[rows], side="right") - 1
+        last = np.searchsorted(place[mine], key[rows], side="right") - 1
         known = last >= 0
         rows, last = rows[known], last[known]
         age[rows] = time[rows] - at[mine][last]
