@@ -188,7 +188,16 @@ class DynamixelBus:
         """Volatile registers as after switching on."""
         self.tables[servo][64:] = bytes(_SIZE - 64)
         self.set(servo, "level", 2)
-        self.set(servo, "current", self.get(servo, "current_limit"))
+        self._full_power(servo)
+
+    def _full_power(self, servo: int) -> None:
+        for name in ("pwm", "current"):
+            self.set(servo, name, self.get(servo, f"{name}_limit"))
+
+    def _powered(self, servo: int) -> bool:
+        """With torque, voltage, and in mode 5 a current."""
+        names = ["torque", "pwm", *(["current"] if self.get(servo, "mode") == 5 else [])]
+        return all(self.get(servo, name) for name in names)
 
     def _write(self, address: int, values: dict[int, bytes]) -> dict[int, int]:
         """The errors of servos that do not take it, by their number."""
@@ -210,7 +219,7 @@ class DynamixelBus:
                 self.set(servo, name, value)
             if "mode" in given:
                 self.set(servo, "profile", 0)
-                self.set(servo, "current", self.get(servo, "current_limit"))
+                self._full_power(servo)
             if given.get("torque"):
                 if self.get(servo, "mode") == 3:
                     self._forget_turns(servo)
@@ -220,7 +229,7 @@ class DynamixelBus:
                 goal[self.ids.index(servo)], taken = float(at), True
         if taken:
             self.goals.append(goal)
-            held = [self.get(servo, "torque") for servo in self.ids]
+            held = [self._powered(servo) for servo in self.ids]
             self.motors.send([g if on else x for g, x, on in zip(goal, self.motors.now(), held, strict=True)])
         return errors
 
@@ -231,20 +240,21 @@ class DynamixelBus:
             return _ACCESS
         if name in ("current", "current_limit") and not model.unit_ma:
             return _ACCESS
+        pwm = self.get(servo, "pwm_limit")
         if name in ("goal", "current", "velocity", "pwm") and self.get(servo, "watchdog") == _OUT:
             return _RANGE
         limit, one_turn = self.get(servo, "current_limit"), self.get(servo, "mode") == 3
         turn = self.get(servo, "min_position"), self.get(servo, "max_position")
         allowed = {
             "mode": (0, 16), "drive_mode": (0, 13), "torque": (0, 1), "level": (0, 2), "watchdog": (0, 127),
-            "profile": (0, 32767), "current": (-limit, limit), "id": (0, 252), "baud": (0, 7),
-            "goal": turn if one_turn else (-1048575, 1048575),
+            "profile": (0, 32767), "current": (-limit, limit), "pwm": (-pwm, pwm),
+            "id": (0, 252), "baud": (0, 7), "goal": turn if one_turn else (-1048575, 1048575),
         }.get(name)  # fmt: skip
         if name == "mode" and value not in (1, 16, *model.modes, *((0,) if model.unit_ma else ())):
             return _RANGE
         if allowed is None or allowed[0] <= value <= allowed[1]:
             return 0
-        return _LIMIT if name in ("goal", "current") else _RANGE
+        return _LIMIT if name in ("goal", "current", "pwm") else _RANGE
 
     def _watch(self) -> None:
         """Bus Watchdogs run out where nobody has asked anything for too long."""

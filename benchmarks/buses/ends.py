@@ -11,6 +11,7 @@ and what a driver needs to find it; then a line of JSON for each line:
     fault KIND        of ROS 2's messages: nan, name, short, old; nothing: none
     pull closed|silent    the cable: connections close, or nothing comes through any more
     plug              back again, and where
+    mark NUMBER       the number: what comes after it answers no earlier question
 """
 
 from __future__ import annotations
@@ -58,6 +59,9 @@ class Dynamixel:
 
     def spoil(self, spoiler: Spoiler) -> None:
         self.bus.spoil = spoiler
+
+    def catch_up(self) -> None:
+        self.bus.catch_up()
 
     def pull(self, silent: bool) -> None:
         if silent:
@@ -140,6 +144,9 @@ class Ros2:
 
     def spoil(self, spoiler: Spoiler) -> None:
         self.spoiler = spoiler
+
+    def catch_up(self) -> None:
+        time.sleep(0.2)  # of discovery and transport nothing is known
 
     def pull(self, silent: bool) -> None:
         if silent:
@@ -258,6 +265,9 @@ class Yarp:
     def spoil(self, spoiler: Spoiler) -> None:
         self._spoiler = spoiler
 
+    def catch_up(self) -> None:
+        time.sleep(0.2)  # the board answers when it has obeyed; the cable may still hold something
+
     def pull(self, silent: bool) -> None:
         if silent:
             self._silent = True
@@ -303,6 +313,8 @@ class End:
 
     def answer(self, line: str) -> Any:
         word, _, rest = line.partition(" ")
+        if word in ("reset", "mark"):
+            self.wire.catch_up()  # what was sent before is obeyed before
         if word == "reset" and self.hand is not None:
             self.hand.reset(int(rest))
         elif word == "goals":
@@ -316,6 +328,8 @@ class End:
             self.wire.fault = rest
         elif word == "pull":
             self.wire.pull(rest == "silent")
+        elif word == "mark":
+            return {"mark": int(rest)}
         elif word == "plug":
             self.wire.plug()
             return self.wire.place

@@ -89,6 +89,17 @@ class End:
             self.process.stdin.flush()
             return json.loads(self._line())
 
+    def resume(self) -> None:
+        """Ask again, after a process that shares this pipe was killed, perhaps before its answer came."""
+        token = time.monotonic_ns()
+        self._lock = threading.Lock()
+        assert self.process.stdin is not None
+        self.process.stdin.write(f"\nmark {token}\n")
+        self.process.stdin.flush()
+        while f'"mark": {token}' not in self._line():
+            pass
+        self.rest()
+
     def rest(self) -> dict[str, Any]:
         """What it says once nothing moves."""
         while (said := self.ask("pose"))["moving"]:

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-import gate as search
+import killed_turns
 import pytest
 import torch
 from light_plant import Fault, Obedient
@@ -303,10 +303,10 @@ def test_of_a_hand_that_is_well_nothing_is_said(held, learns: bool) -> None:
 
 
 @pytest.mark.parametrize(("moment", "learns"), [(0.0, False), (0.12, True), (0.3, False)])
-def test_a_turn_that_was_killed_is_gone_on_with(held, tmp_path: Path, moment: float, learns: bool) -> None:
-    seen, axis, model = held
-    _, end = search.killed((dataclasses.replace(seen, truth=None), axis, model), moment, learns, tmp_path)
-    assert end in ("reached", "at its end")
+def test_a_turn_that_was_killed_is_gone_on_with(tmp_path: Path, moment: float, learns: bool) -> None:
+    with killed_turns.here("light") as hand:
+        _, end = killed_turns.killed(hand, moment, learns, tmp_path, 1.0)
+    assert end in killed_turns.RIGHT
     assert Journal(tmp_path / "turn.ekm").cut_short is False
 
 

@@ -288,6 +288,22 @@ def test_in_mode_3_a_range_beyond_the_servos_limits_is_refused(tmp_path) -> None
         open_at(bus, tmp_path, mode="baud =|mode = 4\nbaud =").close()
 
 
+@pytest.mark.parametrize("name", ["pwm", "pwm_limit", "current", "current_limit"])
+def test_a_servo_that_was_left_without_power_is_told_before_anything_moves(name, tmp_path) -> None:
+    with servos() as bus:
+        bus.set(1, "mode", 5)
+        bus.set(1, name, 0)
+        with pytest.raises(
+            DescriptionError, match=r"toml:15: .*'left': its .* is 0, it cannot move: restore"
+        ):
+            open_at(bus, tmp_path)
+        bus.set(1, name, 20)
+        with open_at(bus, tmp_path) as plant:
+            found = plant.notes[0]
+        told = r"motor 'left': Goal (PWM is 2.26 % of 100 %|Current is 53.8 mA of 3209 mA), as another"
+        assert name.endswith("limit") or re.match(told, found)
+
+
 @pytest.mark.parametrize("turns", [-3, -1, 1])
 def test_turns_that_a_power_cycle_has_taken_are_given_back(turns, tmp_path) -> None:
     with servos(at=1600.0 + 4096 * turns) as bus:

@@ -244,7 +244,7 @@ def look(path: Path) -> None:
 def test_messages_that_contradict_each_other_are_named_with_their_node(
     name, robot, path, monkeypatch
 ) -> None:
-    monkeypatch.setattr("torch_ekm.drivers.ros2._TIMEOUT", 1.0)
+    monkeypatch.setattr("torch_ekm.drivers.ros2._TIMEOUT", 3.0)
     messages, words = WRONG[name]
     for k, message in enumerate(messages):
         robot.says(robot.node(f"node_{k}"), **message)

@@ -66,6 +66,7 @@ def test_a_wiring_is_tried_without_its_bus(driver, tmp_path) -> None:
     done = CliRunner().invoke(app, ["check", "--plant", str(path), "--emulate"])
     assert done.exit_code == 0, done.output
     assert "motors go as commanded" in done.output
+    assert "nothing is connected" in done.output  # and what is not checked
     done = CliRunner().invoke(app, ["check", "--plant", str(path), "--emulate", "--dry-run"])
     unit = {"yarp": "deg", "ros2": "rad"}[driver]
     assert f" {unit} = " in done.output

@@ -170,6 +170,38 @@ def test_stamps_that_fall_are_a_reset_only_where_they_are_one_clock(ros, tmp_pat
     assert "/q has a header.stamp 1e+06 s before it was logged: not used" in table.notes
 
 
+def test_names_count_wherever_a_message_has_them(ros, tmp_path) -> None:
+    """Names of a trajectory and of ros2_control's states are not called ``name``, and change places."""
+    heard: list[Heard] = []
+    for k in range(60):
+        t, (names, goal) = 1 + 0.02 * k, (("ab", [k, -k]), ("ba", [-k, k]))[k % 2]
+        point = [
+            np.array(goal, dtype=float),
+            *[np.array([])] * 3,
+            ros.make("builtin_interfaces/msg/Duration", 0, 1),
+        ]
+        points = [ros.make("trajectory_msgs/msg/JointTrajectoryPoint", *point)]
+        heard.append(
+            (t, "/u", ros.make("trajectory_msgs/msg/JointTrajectory", ros.header(t), list(names), points))
+        )
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/u.points[0].positions.a").tolist() == [*range(60)]
+    assert column(table, "/u.points[0].positions.b").tolist() == [-k for k in range(60)]
+    twice = tmp_path / "twice"
+    twice.mkdir()
+    heard = [(1 + k, "/q", ros.joints(1 + k, ["a", "a"], [1, 2])) for k in range(9)]
+    with pytest.raises(DescriptionError, match="/q: a message has the name 'a' twice"):
+        read_bag(ros.write(twice, heard), "/q")
+
+
+def test_messages_of_one_time_are_a_row_each(ros, tmp_path) -> None:
+    """A simulation's clock stands between its steps."""
+    heard: list[Heard] = [(1 + 0.1 * (k // 4), "/u", ros.array(k)) for k in range(80)]
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/u.data[0]").tolist() == [*range(80)]
+    assert not table.age.any()
+
+
 def test_an_arm_and_a_hand_take_turns_on_one_topic(ros, tmp_path) -> None:
     heard: list[Heard] = []
     for k in range(50):

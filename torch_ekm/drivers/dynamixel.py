@@ -17,6 +17,7 @@ from .servos import SERVOS, Servo
 _TURN = 4096
 _TICKS = _TURN / (2 * math.pi)  # per rad
 _VELOCITY = 0.229 * 2 * math.pi / 60  # [rad/s] of a unit of Profile Velocity
+_PWM = 0.113  # [%] of a unit of Goal PWM
 _WATCHDOG_MS = 80
 _LAST_ID = 252
 # control table of the X series: (address, bytes)
@@ -25,9 +26,9 @@ _GOAL = 112  # Profile Velocity, Goal Position (int32): 8 bytes
 _STATE = (120, 16)  # Realtime Tick, moving at 2, current (int16) at 6, position (int32) at 12
 _REGISTERS = {
     "Model Number": (0, 2), "Firmware Version": (6, 1), "Drive Mode": (10, 1), "Operating Mode": _MODE,
-    "Homing Offset": (20, 4), "Current Limit": (38, 2), "Velocity Limit": (44, 4),
+    "Homing Offset": (20, 4), "PWM Limit": (36, 2), "Current Limit": (38, 2), "Velocity Limit": (44, 4),
     "Max Position Limit": (48, 4), "Min Position Limit": (52, 4), "Torque Enable": _TORQUE,
-    "Bus Watchdog": _WATCHDOG, "Goal Current": _CURRENT, "Goal Position": (116, 4),
+    "Bus Watchdog": _WATCHDOG, "Goal PWM": (100, 2), "Goal Current": _CURRENT, "Goal Position": (116, 4),
     "Present Position": (132, 4),
 }  # fmt: skip
 _ALL = (0, 136)
@@ -105,6 +106,8 @@ class DynamixelPlant(HandDriver):
             self._seen: list[tuple[int, float, float]] = []  # Realtime Ticks, and between which times
             if not self.dry_run:
                 self._prepare(mode, current_ma)
+            self._found = self._registers()
+            self._able_to_move(current_ma)
             self._give_turns_back(self._read().motors)
             if mode == 3:
                 self._within_limits()
@@ -169,6 +172,20 @@ class DynamixelPlant(HandDriver):
                 problem = f"its range is {least} to {most} ticks, its Position Limits are {low} and {high}"
                 remedy = f"write range_deg = [{min(ends):.4g}, {max(ends):.4g}], or mode = 4"
                 raise self.wiring.error("motors", one, f"{problem}: {remedy}", "range_deg")
+
+    def _able_to_move(self, current_ma: float) -> None:
+        """Another program may have left a servo without voltage or current; less than all is said."""
+        for one, model, found in zip(self.wiring.motors, self._models, self._found, strict=True):
+            powers = [("PWM", _PWM, "%"), ("Current", model.unit_ma, "mA")]
+            for power, unit, name in powers if found["Operating Mode"] == 5 else powers[:1]:
+                goal, limit = found[f"Goal {power}"], found[f"{power} Limit"]
+                if not min(goal, limit):
+                    remedy = "restore it with the maker's tool, or switch the servo off and on"
+                    problem = f"its Goal {power} or {power} Limit is 0, it cannot move: {remedy}"
+                    raise self.wiring.error("motors", one, problem)
+                if goal < limit and not (current_ma and power == "Current"):
+                    shown = f"Goal {power} is {goal * unit:.4g} {name} of {limit * unit:.4g} {name}"
+                    self.notes.append(f"motor '{one.name}': {shown}, as another program left it")
 
     def _prepare(self, mode: int, current_ma: float) -> None:
         """Mode and current; a servo that is in its mode keeps its torque, and what it holds."""

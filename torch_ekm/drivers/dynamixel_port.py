@@ -9,7 +9,6 @@ from .._extras import require
 from ..exceptions import BusError, EKMError
 
 T = TypeVar("T")
-_TRIES = 2  # of a question
 _PATIENCE_MS = 100.0  # for an answer, where the SDK's 34 ms are less: both ends may share a busy machine
 _LOOK = 0.001  # [s] the port sleeps for an answer before the SDK asks again
 _HARDWARE = (70, 1)
@@ -154,10 +153,9 @@ class DynamixelPort:
             raise BusError(what, self._packets.getTxRxResult(result))
 
     def _again(self, ask: Callable[[], T]) -> T:
-        """What a question brings; one without an answer, or with a spoilt one, is asked again."""
-        for _ in range(_TRIES - 1):
-            with contextlib.suppress(BusError), self._told():
-                return ask()
+        """What a question brings; one without an answer, or with a spoilt one, is asked once again."""
+        with contextlib.suppress(BusError), self._told():
+            return ask()
         with self._told():
             return ask()
 

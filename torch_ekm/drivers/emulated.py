@@ -18,7 +18,8 @@ class EmulatedPlant(HandDriver):
     """An empty hand without a bus, wired as its file says: a wiring file can be tried before there is a hand.
 
     Motors go straight to their goals at ``limits.rate``, from where the springs have the hand; joints rest
-    where couplings and springs have them, fingertips touch nothing.
+    where couplings and springs have them, fingertips touch nothing. Packets, messages, ids and what servos
+    refuse are not emulated.
 
     Args:
         wiring: of any driver; the bus is not opened.
@@ -34,6 +35,12 @@ class EmulatedPlant(HandDriver):
         here = np.clip(hand.unloaded(rest), lower, upper)
         self._from, self._goal, self._sent = here, here, time.monotonic()
         self._map = ActuationMap(hand)
+        said = (
+            "nothing is connected: motors, joints and pads of an empty hand are emulated in the file's units"
+        )
+        self.notes.append(
+            f"{said}; ids, models, limits and messages of the {wiring.driver} bus are not checked"
+        )
 
     def _read(self) -> BusReading:
         now = time.monotonic()

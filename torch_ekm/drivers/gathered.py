@@ -10,6 +10,7 @@ from ..exceptions import BusError
 _SAME = 0.5  # [s] messages that are later from the first one on come from a clock that is behind
 _DRIFT = 2e-4  # that clocks part from each other
 _ALIVE = 0.5  # [s] of a publisher since its last message
+_NAMELESS = "messages without names"
 
 
 class Value(NamedTuple):
@@ -74,7 +75,7 @@ class Gathered:
         """A message: of each part as many numbers as names, or none."""
         with self._lock:
             taken = self.clocks.setdefault(publisher, SenderClock()).taken(late, arrived)
-            self.heard.update(dict.fromkeys(names, arrived))
+            self.heard.update(dict.fromkeys(names or [_NAMELESS], arrived))
             mine = [name for name in names if name in self.wanted]
             if not mine:
                 return
@@ -86,7 +87,8 @@ class Gathered:
                 for name, number in zip(names, numbers, strict=False):
                     if name in self.wanted:
                         by = self._values.setdefault((part, name), {})
-                        by[publisher] = Value(float(number), taken, publisher)
+                        if publisher not in by or by[publisher].taken <= taken:  # else one overtook it
+                            by[publisher] = Value(float(number), taken, publisher)
 
     def _contradiction(self, names: Sequence[str], parts: Mapping[str, Sequence[float]]) -> str:
         """What is wrong with a message; "": nothing."""

@@ -106,11 +106,11 @@ class Ros2Plant(HandDriver):
                 lambda: None not in self._newest("position", self._ids),
                 lambda: self._states.absent(self._ids) + (_ONLY_RELIABLE if reliable else ""),
             )
-            end = time.monotonic() + _TIMEOUT
-            while not self.dry_run and self._publisher.get_subscription_count() == 0:
-                if time.monotonic() > end:
-                    raise BusError(topic, "no node subscribes to it: is the controller running?")
-                time.sleep(0.01)
+            self._first(
+                lambda: self.dry_run or self._publisher.get_subscription_count() > 0,
+                lambda: "no node subscribes to it: is the controller running?",
+                topic,
+            )
             # a node of our own name may be one that was killed: it stays in the graph for some seconds
             own = f"{self.node.get_namespace().rstrip('/')}/{self.node.get_name()}"
             others = {name for name, _ in self.publishers(topic)} - {own}
@@ -175,11 +175,11 @@ class Ros2Plant(HandDriver):
     def _take_force(self, message: Any, info: Any) -> None:
         self._force = message.data, self.lateness(None, info)[1]
 
-    def _first(self, came: Callable[[], bool], problem: Callable[[], str]) -> None:
+    def _first(self, came: Callable[[], bool], problem: Callable[[], str], topic: str = "") -> None:
         end = time.monotonic() + _TIMEOUT
         while not came():
             if time.monotonic() > end:
-                raise BusError(self._states_topic, problem())
+                raise BusError(topic or self._states_topic, problem())
             time.sleep(0.005)
 
     def _newest(self, part: str, ids: Sequence[str]) -> list[Value | None]:

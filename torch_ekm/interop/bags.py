@@ -21,6 +21,7 @@ Numbers = NDArray[np.integer[Any]]
 AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.typesys")
 
 _MOST = 64  # numbers of one field; more is an image or a cloud
+_LABELS = ("name", "joint_names", "interface_names")  # of a message, for the entries of its arrays
 _LEFT_OUT = ("header", "layout")  # stamps and array shapes
 _HELD = 10  # mean intervals of a column that a value stands for; later the sensor is silent
 _BACK = 0.1  # [s] a clock that falls by more was set back
@@ -76,7 +77,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
             for place, (topic, kind, logged, raw) in enumerate(_written(reader, wanted)):
                 one = heard.setdefault(topic, _Topic(topic))
                 one.take(place, logged, reader.deserialize(raw, kind))
-    except UnknownNameError:
+    except (UnknownNameError, DescriptionError):
         raise
     except FileNotFoundError:
         raise DescriptionError(path, "there is no such recording") from None
@@ -151,13 +152,15 @@ def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
     run = {name: np.searchsorted(starts, heard[name].place, side="right") for name in order}
     rows = np.lexsort((when[clock][0], run[clock]))
     time, runs = when[clock][0][rows], run[clock][rows]
+    row_of = np.argsort(rows)  # rows of one time each have their own message
     if starts:
         notes.append(f"{len(np.unique(runs))} runs: a clock was set back")
     notes += [said for _, said in when.values() if said]
     names, values, ages = [], [], []
     for topic in order:
         for name, (at, given) in heard[topic].columns.items():
-            value, age = _held(time, runs, when[topic][0][at], run[topic][at], np.array(given))
+            taken, order = when[topic][0][at], (np.arange(len(rows)), row_of[at]) if topic == clock else None
+            value, age = _held(time, runs, taken, run[topic][at], np.array(given), order)
             names.append(name)
             values.append(value)
             ages.append(age)
@@ -167,16 +170,22 @@ def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
     return BagTable(tuple(names), time - time[0], values, ages, number, tuple(notes))
 
 
-def _held(time: Array, runs: Numbers, at: Array, run: Numbers, given: Array) -> tuple[Array, Array]:
-    """Of each row the newest value of its run, and its age; NaN: there is none, or it is too old."""
-    order = np.lexsort((at, run))
-    at, run, given = at[order], run[order], given[order]
+def _held(
+    time: Array, runs: Numbers, at: Array, run: Numbers, given: Array, places: tuple[Numbers, Numbers] | None
+) -> tuple[Array, Array]:
+    """Of each row the newest value of its run, by times or by ``places`` of rows and values; and its age.
+
+    NaN: there is none, or it is too old.
+    """
+    key, place = (time, at) if places is None else places
+    order = np.lexsort((place, run))
+    at, place, run, given = at[order], place[order], run[order], given[order]
     steps = np.diff(at)[np.diff(run) == 0]
     most = _HELD * steps.mean() if len(steps) > 1 else np.inf
     value, age = np.full(len(time), np.nan), np.full(len(time), np.nan)
     for one in np.unique(run):
         mine, rows = run == one, np.flatnonzero(runs == one)
-        last = np.searchsorted(at[mine], time[rows], side="right") - 1
+        last = np.searchsorted(place[mine], key[rows], side="right") - 1
         known = last >= 0
         rows, last = rows[known], last[known]
         age[rows] = time[rows] - at[mine][last]
@@ -223,22 +232,26 @@ def _by_place(bag: Any, wanted: list[Any]) -> list[tuple[Any, int, bytes]]:
     return [message for _, message in sorted(pairs, key=lambda one: (one[0].chunk_pos, one[0].offset))]
 
 
-def _numbers(value: Any, place: str) -> Iterator[tuple[str, float]]:
-    """The numbers of a message, by name; joint names stand for indices where a message has them."""
+def _numbers(value: Any, place: str, labels: Sequence[str] = ()) -> Iterator[tuple[str, float]]:
+    """The numbers of a message, by name; names that it has stand for indices, also in what it contains.
+
+    Raises:
+        DescriptionError: a name stands in it twice.
+    """
     if is_dataclass(value):
-        given = getattr(value, "name", None)
-        labels = given if isinstance(given, list) else []
+        for key in _LABELS:
+            given = getattr(value, key, None)
+            if isinstance(given, list) and given and all(isinstance(one, str) for one in given):
+                labels = given
+        if twice := [one for one in dict.fromkeys(labels) if labels.count(one) > 1]:
+            raise DescriptionError(place, f"a message has the name '{twice[0]}' twice")
         for one in fields(value):
-            part = getattr(value, one.name)
-            if one.name in _LEFT_OUT or one.name.startswith("__"):
-                continue
-            if labels and isinstance(part, np.ndarray) and len(part) == len(labels):
-                for label, number in zip(labels, part, strict=True):
-                    yield f"{place}.{one.name}.{label}", float(number)
-            else:
-                yield from _numbers(part, f"{place}.{one.name}")
+            if one.name not in _LEFT_OUT and not one.name.startswith("__"):
+                yield from _numbers(getattr(value, one.name), f"{place}.{one.name}", labels)
     elif isinstance(value, bool | int | float | np.number | np.bool_):
         yield place, float(value)
     elif isinstance(value, list | np.ndarray) and len(value) <= _MOST:
-        for i, one in enumerate(value):
-            yield from _numbers(one, f"{place}[{i}]")
+        named = len(value) == len(labels) > 0 and not isinstance(value[0], str)
+        places = [f".{label}" for label in labels] if named else [f"[{i}]" for i in range(len(value))]
+        for at, one in zip(places, value, strict=True):
+            yield from _numbers(one, f"{place}{at}", () if named else labels)

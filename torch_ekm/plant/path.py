@@ -47,10 +47,10 @@ class Path:
         Raises:
             ShapeError, NonFiniteError, ParameterError: see :class:`Path`, or the speed is not positive.
         """
-        n = len(waypoints)
-        path = cls(waypoints, torch.arange(1.0, n + 1))
+        path = cls(waypoints, torch.arange(1.0, len(waypoints) + 1))
         seconds = path.pieces.abs().amax(1) / check_positive("speed", speed)
-        return cls(path.waypoints, seconds.clamp(min=_LEAST).cumsum(0))
+        object.__setattr__(path, "times", seconds.clamp(min=_LEAST).cumsum(0))  # looked at already
+        return path
 
     @property
     def pieces(self) -> Float[Tensor, "n n_a"]:
