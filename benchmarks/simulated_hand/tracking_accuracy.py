@@ -47,11 +47,6 @@ def measure_tracking(
     seed: int = 0,
     camera: SimulatedCamera | None = None,
     known_camera: PinholeCamera | None = None,
-<<<<<<< HEAD
-    edges: bool = True,
-=======
-    max_tilt_deg: float = 50.0,
->>>>>>> sim
 ) -> TrackingAccuracy:
     """Track two boards at 0.35 to 0.45 m, each tilted up to 50 deg, in any direction and spin.
 
@@ -63,11 +58,6 @@ def measure_tracking(
         seed: of the first one.
         camera: takes the pictures.
         known_camera: what the tracker takes the lens for; by default the truth.
-<<<<<<< HEAD
-        edges: refine the poses on the edges of the markers.
-=======
-        max_tilt_deg: largest angle between a card's normal and the line of sight [deg].
->>>>>>> sim
     """
     camera = camera or SimulatedCamera()
     boards = MarkerBoard(0), MarkerBoard(4)
