@@ -19,7 +19,6 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
-from torch_ekm.control.safety.fingertips import FingertipWatch
 from torch_ekm.control.safety.watch import Watch
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.plant import Observation
@@ -72,7 +71,7 @@ def test_moment_arms_that_are_not_as_described_are_no_fault_of_a_sensor(held) ->
     way = J_a @ turned
     for arms, blamed in ((1.0, False), (1.3, False), (2.5, True)):
         q, a = seen.q + torch.from_numpy(turned), seen.a + torch.from_numpy(arms * way)
-        assert ("'index_distal'" in watch.suspects(dataclasses.replace(seen, q=q, a=a))) is blamed
+        assert ("'index_distal'" in watch.motions.suspects(dataclasses.replace(seen, q=q, a=a))) is blamed
 
 
 def test_a_reading_that_is_one_joint_short_ends_the_loop_with_its_name(held) -> None:
@@ -111,6 +110,6 @@ def test_joints_that_say_nothing_of_forces_do_not_contradict_the_fingertips(
     held, monkeypatch: pytest.MonkeyPatch, by_joints: float, told: bool
 ) -> None:
     """Joints without springs behind rigid motors give next to nothing, whatever the pads press with."""
-    watch = FingertipWatch(Guards(), held[2])
-    monkeypatch.setattr(watch, "_by_joints", lambda seen: {0: by_joints, 1: by_joints})
-    assert bool(watch._scale(held[0], torch.full((5,), 4.0, dtype=torch.float64))) is told
+    tests = Watch(Guards(), held[2]).motions
+    monkeypatch.setattr(tests, "_by_joints", lambda seen: {0: by_joints, 1: by_joints})
+    assert bool(tests._scale(held[0], torch.full((5,), 4.0, dtype=torch.float64))) is told

@@ -20,7 +20,7 @@ from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
 from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
-from .ends import Ends, hindrances
+from .ends import Ends, Safety, hindrances
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
 from .learned import Learned
@@ -28,9 +28,8 @@ from .lessons import Lessons
 from .manipulation import Manipulation, Step, Stop
 from .plan import OneStep, Plan, Planner, WholeTurn
 from .reach import Reach, Reachability, out_of_reach, reach, reachability
-from .safety import Safety
+from .safety.guards import Objection
 from .safety.on_the_way import OnTheWay
-from .safety.safety import Objection
 from .safety.watch import Watch
 
 _GRIPS, _AGAIN = 2, 4  # movements that only grip, before the first turn and in all, one after each turn
@@ -235,11 +234,8 @@ class ClosedLoop:
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
                 said = "; ".join(filter(None, (decision.message, plan.end.message)))
-                return Stop(decision.status, seen, said + ends.surprise + watch.suspects(seen))
-            weak = "" if turns or not decision.turns else watch.weak(decision, seen)
-            if weak:
-                return Stop(StopReason.WEAK_GRASP, seen, weak)
-            halt = watch.command(decision, seen)
+                return Stop(decision.status, seen, said + ends.surprise + watch.motions.suspects(seen))
+            halt = watch.command(decision, seen, first=decision.turns and not turns)
             if halt is not None:
                 continue
             step, halt = self._move(seen, decision, ends, watch, seconds)

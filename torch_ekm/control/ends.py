@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from .._checks import check_kind
+from .._noise import DEGREE
+from ..exceptions import ParameterError
 from ..model import ModelStatus
 from ..plant import Observation, PlantStatus
 from .decision import Decision, StopReason
 from .focus import A_TARGET, FocusedPose, PoseTarget
 from .limiting import FIRM
-from .safety.safety import Objection, StoppingRule
+from .safety.guards import Guards, Objection
 
 if TYPE_CHECKING:
     from ..model import KinematicModel
@@ -19,6 +22,60 @@ if TYPE_CHECKING:
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
 _AT_STOP = math.radians(0.5)  # a joint as near to the end of its range stands there
 _BEARS = 0.2e-3  # [m] a link as near to the object as this bears on it
+
+
+@dataclass(frozen=True)
+class StoppingRule:
+    """Explicit parameters of the stopping rule; the same for every controller that is compared.
+
+    * reached: ``|e| <= tolerance``, e by the mean of ``looks`` to ``most_looks`` readings at rest: further
+      ones are taken while the mean is nearer to the tolerance than it is sure;
+    * stalled: within the last ``stall_window`` steps the smallest ``|e|`` fell by less than
+      ``stall_progress``;
+    * actuator limits: as stalled, while some actuator that matters stood at its limit;
+    * step limit: ``max_steps`` commands were given;
+    * object lost: the plant says so, or the object turned off the focus by more than
+      ``off_limit`` [rad]: it is dislocated, and no small step brings it back.
+    """
+
+    tolerance: float = 0.25 * DEGREE
+    """[rad], see :class:`~torch_ekm.control.FocusedPose`; at 0.25 deg each direction has its own."""
+    looks: int = 2
+    most_looks: int = 4
+    stall_window: int = 12
+    stall_progress: float = 0.1 * DEGREE
+    """[rad], likewise"""
+    max_steps: int = 60
+    off_limit: float = 30 * DEGREE
+
+    def __post_init__(self) -> None:
+        for name in ("tolerance", "looks", "most_looks", "stall_window", "max_steps", "off_limit"):
+            if not getattr(self, name) > 0:
+                raise ParameterError(name, getattr(self, name), "positive")
+
+    def judge(self, errors: list[float], limited: bool = False) -> StopReason:
+        """Judge the history of ``|e|``, one entry for each observation, the newest last.
+
+        Args:
+            limited: the last step was cut short by an actuator's limit.
+        """
+        if len(errors) > self.stall_window:
+            before, after = min(errors[: -self.stall_window]), min(errors[-self.stall_window :])
+            if before - after < self.stall_progress:
+                return StopReason.ACTUATOR_LIMITS if limited else StopReason.STALLED
+        if len(errors) > self.max_steps:
+            return StopReason.STEP_LIMIT
+        return StopReason.RUNNING
+
+
+@dataclass(frozen=True)
+class Safety:
+    """Which readings count, and when the hand stops; the same for every controller that is compared."""
+
+    rule: StoppingRule = StoppingRule()
+    """Reached, stalled, step limit, actuator limits, object lost."""
+    guards: Guards = field(default_factory=Guards)
+    """Stale sensor, and all reasons that follow it in :class:`StopReason`."""
 
 
 class Ends:
