@@ -235,6 +235,11 @@ def gravest(said: list[Objection]) -> Objection | None:
     return max(said, key=lambda one: one.effect, default=None)
 
 
+def ended(said: list[Objection]) -> Objection | None:
+    """The first that ends the manipulation."""
+    return next((one for one in said if one.effect is Effect.STOP), None)
+
+
 def deg(angle: Any) -> str:
     """An angle [rad] as a text in degrees."""
     return f"{float(angle) / DEGREE:.3g} deg"

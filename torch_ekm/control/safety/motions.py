@@ -11,32 +11,30 @@ import torch
 
 from ..._noise import DEGREE, NOISE
 from ...exceptions import GraspError
-from ...kinematics import ServoModel
-from ...kinematics.servo_model import IdealServos
 from ...model import ModelStatus
 from ...plant import Observation
 from ...typing import Array, Tensor
 from ..decision import Decision, Expectation
-from .guards import Guards, Objection, check, deg
-from .readings import HOLDS, ReadingTests
+from .guards import Objection, check, deg
+from .readings import AGAINST, ReadingTests
 
 if TYPE_CHECKING:
+    from ...kinematics import ServoModel
+    from ...kinematics.servo_model import IdealServos
     from ...model import KinematicModel, Linearization
 
 _SURPRISE = 3.0  # [N] above the model: joints and springs are asked; a pad that reads none of it is dead
-_JOINT_STD, _JOINT_SHARE = 0.75, 0.25  # of a normal force by joints and springs alone [N], and of itself
+_JOINT_STD = 0.75  # [N] of a normal force by joints and springs alone, beside its share
 _SCALE = 1.75  # between all fingertips and joints and springs: used hands come to 1.5
 _NOTHING = 5.0  # so many times more: joints without springs behind rigid motors say nothing of forces
 _WEAK = 0.75  # of what it should bear, that a finger lacks with which nothing is turned
 _NOWHERE = 0.5 * DEGREE  # an encoder moves less in a motion in which its motor is sent nowhere
-_AGAINST = 0.3  # share of a predicted motion that is made the other way; healthy hands make .4 of it and more
 # e = alpha w + beta + noise of what the joints leave of an encoder's motion w: beta is its drift
 _DRIFT_STD, _REST_STD = 2.0 * DEGREE, 0.4 * DEGREE  # of beta; noise, a first guess
 _GUESS, _FEWEST = 4, 6  # that is worth so many motions; and with fewer nothing is said
 _SURE = 6.0  # standard deviations from which it is called one, if it is as large as the noise in each motion
-_BIAS, _BOTH = 0.6 * DEGREE, 1.5  # a servo's bias of this size that says the same makes it as much surer
+_BOTH = 1.5  # a servo's bias of twice what servos have that says the same makes it as much surer
 _OFFSETS = torch.arange(-8.0, 8.1, 0.5, dtype=torch.float64) * DEGREE  # of all joints, that are tried
-_LEAST = 1.5 * DEGREE  # of them that is worth a word
 _GAP = 2e-3  # [m] rms of the pads' distances from the object, from which they are suspicious
 _CLOSES = 0.4  # share of it that an offset leaves, if it is to blame
 
@@ -46,20 +44,15 @@ class MotionTests:
     joints against the object's surface.
 
     Args:
-        guards: limits.
         readings: tests and limits of single readings.
         model: f, with the hand.
         servo: what is known of the servos.
     """
 
     def __init__(
-        self,
-        guards: Guards,
-        readings: ReadingTests,
-        model: KinematicModel,
-        servo: ServoModel | IdealServos,
+        self, readings: ReadingTests, model: KinematicModel, servo: ServoModel | IdealServos
     ) -> None:
-        self.guards, self.readings, self.hand, self.model = guards, readings, model.hand, model
+        self.guards, self.readings, self.hand, self.model = readings.guards, readings, model.hand, model
         self.servo, self.pads = servo, [pad.name for pad in model.hand.pads]
         self._least = model.options.forces.normal_std
         self._begun: Observation | None = None
@@ -169,7 +162,7 @@ class MotionTests:
         return dict(zip(pads, lin.forces.normal[rows].tolist(), strict=True)) if lin.forces.solved else {}
 
     def _contradicts(self, force: float, expected: float) -> bool:
-        variance = self._least**2 + _JOINT_STD**2 + (_JOINT_SHARE * expected) ** 2
+        variance = self._least**2 + _JOINT_STD**2 + (NOISE.force_share * expected) ** 2
         return (force - expected) ** 2 > self.guards.gate**2 * variance
 
     # -- encoders, joints and object -------------------------------------------------------------------------
@@ -184,7 +177,7 @@ class MotionTests:
         said = check("drifts", abs(float(moved[i])), _NOWHERE, words, name=names[i])
         if expected is not None:
             share, sharp = self.readings.share(before, seen, expected.nominal)
-            said += check("joints against", -share * (sharp >= self.guards.gate), _AGAINST, share=share)
+            said += check("joints against", -share * (sharp >= self.guards.gate), AGAINST, share=share)
             rate, sure = self._drift(before, seen, expected)
             i = int(abs(sure).argmax())
             large = abs(rate[i]) > _REST_STD
@@ -213,7 +206,7 @@ class MotionTests:
         # joints may be bent by other motors where this one stands
         judged = (n >= _FEWEST) & (ww > n * _REST_STD**2)
         bias = self.servo.bias.numpy()
-        surer = np.where((abs(bias) > _BIAS) & (bias * beta > 0), _BOTH, 1.0)
+        surer = np.where((abs(bias) > 2 * NOISE.bias) & (bias * beta > 0), _BOTH, 1.0)
         return beta, np.where(judged, surer * beta / std, 0.0)
 
     def _bears(self, lin: Linearization) -> bool:
@@ -251,7 +244,7 @@ class MotionTests:
         """All joints together are off by an angle that brings the pads back to the object's surface."""
         gaps, here = [self._distance(seen, float(c)) for c in _OFFSETS], self._distance(seen)
         at = min(range(len(gaps)), key=gaps.__getitem__)
-        if not (here > _GAP and gaps[at] < _CLOSES * here and abs(_OFFSETS[at]) >= _LEAST):
+        if not (here > _GAP and gaps[at] < _CLOSES * here and abs(_OFFSETS[at]) >= 3 * NOISE.joint):
             return ""
         far = "far from" if math.isinf(here) else f"{1e3 * here:.1f} mm off"
         return (
@@ -268,7 +261,7 @@ class MotionTests:
         """Pads that hold the object, as measured."""
         if seen.fingertip_force is None:
             return None
-        return [name for name, f in zip(self.pads, seen.fingertip_force, strict=True) if f > HOLDS]
+        return [name for name, f in zip(self.pads, seen.fingertip_force, strict=True) if f > NOISE.pressing]
 
     def _distance(self, seen: Observation, offset: float = 0.0) -> float:
         """Of the pads that press from the object's surface, rms, if all joints were off by an offset [m];

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from ..._noise import DEGREE
+from ..._noise import DEGREE, NOISE
 from ...plant import Observation, PlantStatus
 from ...typing import Array, Tensor
 from ..decision import Expectation
@@ -18,11 +18,10 @@ if TYPE_CHECKING:
     from ...description import HandDescription
     from ..focus import FocusedPose
 
-HOLDS = 1.0  # [N] by a pad that holds an object
 _SENSORS = {
     "encoders": "the encoders' reading", "joints": "the joints' reading", "pose": "the object's pose",
 }  # fmt: skip
-_AGAINST = 0.5  # share of a command, that encoders make the other way
+AGAINST = 0.3  # share of a motion that is made the other way; healthy hands make .4 of it and more
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
 
 
@@ -125,7 +124,7 @@ class ReadingTests:
         if abs(v).max() >= guards.unchanged:
             share, i = float(moved @ v) / float(v @ v), int((moved * v).argmin())
             angles, name = {"went": moved[i], "sent": v[i]}, hand.actuator_names[i]
-            said += check("encoders against", -share, _AGAINST, angles, share=share, name=name)
+            said += check("encoders against", -share, AGAINST, angles, share=share, name=name)
         return said
 
     def _speed(self, before: Observation, seen: Observation) -> list[Objection]:
@@ -211,7 +210,7 @@ class ReadingTests:
 
 def hold(seen: Observation) -> bool:
     """Two fingertips at least measure a force: an object is between them."""
-    return seen.fingertip_force is not None and int((seen.fingertip_force > HOLDS).sum()) > 1
+    return seen.fingertip_force is not None and int((seen.fingertip_force > NOISE.pressing).sum()) > 1
 
 
 def agree(one: Observation, other: Observation, guards: Guards) -> bool:

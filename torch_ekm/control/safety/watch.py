@@ -3,29 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from ..._noise import DEGREE
-from ...kinematics import ServoModel
-from ...kinematics.servo_model import IdealServos
+from ..._noise import DEGREE, NOISE
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
 from ..lessons import felt
-from .guards import TABLE, Effect, Guards, Objection, check, deg, gravest
+from .guards import TABLE, Effect, Guards, Objection, check, deg, ended, gravest
 from .motions import MotionTests
 from .readings import ReadingTests, agree
 
 if TYPE_CHECKING:
+    from ...kinematics import ServoModel
+    from ...kinematics.servo_model import IdealServos
     from ...model import KinematicModel
 
 _STILL = 0.05 * DEGREE  # an encoder that moves less stands
-_ASKED = 0.5 * DEGREE  # a smaller command to a motor that was stuck before does not show whether it still is
 _UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
 
 
@@ -53,20 +51,15 @@ class Watch:
         guards: limits.
         model: f, with the hand.
         tolerance: of the target [rad]; errors that grow by more are no noise.
-        servo: what is known of the servos; None: they are ideal.
+        servo: what is known of the servos.
     """
 
     def __init__(
-        self,
-        guards: Guards,
-        model: KinematicModel,
-        tolerance: float = math.inf,
-        servo: ServoModel | IdealServos | None = None,
+        self, guards: Guards, model: KinematicModel, tolerance: float, servo: ServoModel | IdealServos
     ) -> None:
         self.guards, self.hand = guards, model.hand
-        servo = IdealServos(model.hand.actuator_names) if servo is None else servo
         self.readings = ReadingTests(guards, model.hand)
-        self.motions = MotionTests(guards, self.readings, model, servo)
+        self.motions = MotionTests(self.readings, model, servo)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0
@@ -182,7 +175,7 @@ class Watch:
         status = PlantStatus.NOT_SEEN
         seen = dataclasses.replace(seen, position=pose.position, rotation=pose.rotation, status=status)
         self.blind += 1
-        halt = _end(said)
+        halt = ended(said)
         if halt is None and self.blind > most:
             more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
             halt = Objection(doubt.reason, more)
@@ -196,7 +189,7 @@ class Watch:
         said: list[Objection],
     ) -> Verdict:
         """Of a reading with its pose."""
-        measured, halt = self.blind == 0, _end(said)
+        measured, halt = self.blind == 0, ended(said)
         self.blind, self.gated = 0, 0 if doubt is None else self.gated + 1
         # what is seen again and again is the truth, and the model is wrong
         true = doubt is None or (self.gated > self.guards.blind_motions and not self.slid)
@@ -253,14 +246,9 @@ class Watch:
         """
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
         self._still = (self._still + 1) * (still & (size > self.guards.stuck_command))
-        which = (self._still > 1) | (stuck & still & (size > _ASKED))
+        which = (self._still > 1) | (stuck & still & (size > NOISE.dead_zone))
         names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in which.nonzero().flatten().tolist())
         return gravest(check("stuck", len(names), 0, names=names))
-
-
-def _end(said: list[Objection]) -> Objection | None:
-    """The first that ends the manipulation."""
-    return next((one for one in said if one.effect is Effect.STOP), None)
 
 
 def _with_events(seen: Observation, earlier: Observation) -> Observation:
