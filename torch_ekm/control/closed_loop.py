@@ -20,14 +20,14 @@ from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
 from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
-from .ends import Ends, Safety, hindrances
+from .ends import Ends, Safety, failed
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
 from .learned import Learned
 from .lessons import Lessons
 from .manipulation import Manipulation, Step, Stop
 from .plan import OneStep, Plan, Planner, WholeTurn
-from .reach import Reach, Reachability, out_of_reach, reach, reachability
+from .reach import Reach, Reachability, reach, reachability
 from .safety.guards import Objection
 from .safety.on_the_way import OnTheWay
 from .safety.watch import Watch
@@ -190,7 +190,7 @@ class ClosedLoop:
                 self.hold()
                 if last is None or not (error is failure or isinstance(error, KeyboardInterrupt)):
                     raise
-                return Stop.failed(error, last)
+                return failed(error, last)
             except BaseException:  # a closed generator as well: the hand must not go on
                 self.hold()
                 raise
@@ -203,7 +203,7 @@ class ClosedLoop:
         self.knowledge.error.begin()
         self.controller.tighter = float(self.knowledge.error.tighter)
         self._figures.begin(seen.a)
-        ends = Ends(self.safety.rule, target, self.controller.focus, seen)
+        ends = Ends(self.safety.rule, target, self.controller, seen)
         grips = turns = 0
         decision = None
         while True:
@@ -211,20 +211,11 @@ class ClosedLoop:
                 self.hold()
                 return Stop(halt.reason, seen, halt.message)
             seen, looks = self._look(seen, ends, watch)
-            over = ends.over(seen, looks)
+            over = ends.over(seen, looks, decision, self._stop.is_set(), self.decline)
             if over is not None:
-                why = over.message
                 if over.reason is StopReason.OBJECT_LOST:
                     self.knowledge.error.slid(lost=True)
-                if over.reason is StopReason.STALLED:
-                    why = hindrances(seen, decision, self.controller.kinematic)
-                return Stop(over.reason, seen, why)
-            if self._stop.is_set():
-                return Stop(StopReason.STOPPED, seen)
-            if self.decline and decision is None and seen.status is PlantStatus.HELD:
-                against = out_of_reach(self.controller, seen, target)
-                if against:
-                    return Stop(StopReason.OUT_OF_REACH, seen, against)
+                return Stop(over.reason, seen, over.message)
             began = time.perf_counter()
             if turns:
                 firm = _LEAST if grips < _AGAIN and decision is not None and decision.turns else 0.0
