@@ -43,8 +43,7 @@ from torch_ekm.control import (
     PoseTarget,
     Safety,
 )
-from torch_ekm.control.safety.guards import Effect
-from torch_ekm.control.safety.readings import ReadingTests
+from torch_ekm.control.safety.readings import Effect, ReadingTests
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError
 from torch_ekm.kinematics.se3 import exp

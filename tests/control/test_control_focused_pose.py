@@ -52,7 +52,7 @@ def target(degrees: float = 0.0, millimetres: float = 0.0) -> PoseTarget:
         (lambda: Direction(X, "mm", tolerance=0.0), ParameterError, "tolerance"),
         (lambda: Direction(X, "mm", step=math.nan), ParameterError, "step"),
         (lambda: Direction(X, "mm", weight=-1.0), ParameterError, "weight"),
-        (lambda: FocusedPose([Direction(X, "mm"), Direction(-2 * X, "mm")]), ParameterError, "named once"),
+        (lambda: FocusedPose([Direction(X, "mm"), Direction(-2 * X, "mm")]), ParameterError, "perpendicular"),
         (lambda: FocusedPose([Direction(X, "mm"), Direction(X + Y, "mm")]), ParameterError, "perpendicular"),
         (lambda: FocusedPose([]), ParameterError, "one to six"),
         (lambda: FocusedPose(Direction(X, "mm")), ParameterError, "a list of one to six Directions"),

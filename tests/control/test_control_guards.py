@@ -391,7 +391,7 @@ def test_guards_have_limits_of_their_own() -> None:
 
 
 def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> None:
-    """100 observations each, median of three seeds; 100,000 by ``benchmarks/gate.py``."""
+    """100 observations each, median of five seeds; 100,000 by ``benchmarks/gate.py``."""
     seen, axis, model = held
 
     def session(chance: float, observations: int, seed: int) -> tuple[Obedient, ClosedLoop]:
@@ -422,9 +422,9 @@ def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> N
         return float(torch.stack(off).norm() / torch.stack(way).norm())
 
     errors = []
-    for seed in range(4, 7):
+    for seed in range(4, 9):
         plant, fuzzed = session(0.15, observations=100, seed=seed)
         assert float(torch.stack(plant.given).abs().max()) <= Guards().increment + 1e-9
         errors.append(error(fuzzed.controller.enhanced, fuzzed.knowledge))
     nothing = EnhancedModel.for_grasp(model, seen.state), HandKnowledge.of(model.hand)
-    assert sorted(errors)[1] < 0.6 * error(*nothing)
+    assert sorted(errors)[2] < 0.6 * error(*nothing)
