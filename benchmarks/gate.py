@@ -39,7 +39,7 @@ from torch_ekm.control import (
     PoseTarget,
     Safety,
 )
-from torch_ekm.control.safety.readings import ReadingTests
+from torch_ekm.control.safety.readings import Effect, ReadingTests
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
@@ -165,7 +165,7 @@ def refusals() -> Iterator[dict[int, torch.Tensor]]:
 
         def judged(self, *args):
             doubt, seen = judge(self, *args), args[place]
-            if doubt is not None and not (doubt.blind or doubt.gated):
+            if doubt is not None and doubt.effect is Effect.STOP:
                 refused[id(seen.q)] = seen.q  # kept, so that no other tensor gets this identity
             return doubt
 

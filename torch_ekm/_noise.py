@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-_DEG = math.pi / 180
+DEGREE = math.pi / 180
 
 
 @dataclass(frozen=True)
@@ -14,26 +14,26 @@ class Noise:
 
     position: float = 0.3e-3
     """Of the object's place, or of a motion of it [m]: a camera at half a metre."""
-    rotation: float = 0.3 * _DEG
+    rotation: float = 0.3 * DEGREE
     """Of the object's orientation, or of a motion of it [rad]."""
-    joint: float = 0.5 * _DEG
+    joint: float = 0.5 * DEGREE
     """Of a joint with a sensor, or of a motion of it [rad]: Hall sensors after a calibration."""
-    unsensed_joint: float = 10 * _DEG
+    unsensed_joint: float = 10 * DEGREE
     """Of a joint that only a cable tells of [rad]: pulleys are not as described, and cables stretch."""
-    wrong_joint: float = 30 * _DEG
+    wrong_joint: float = 30 * DEGREE
     """Of a joint whose sensor is wrong [rad]: its range."""
     encoder: float = 0.0436
     """By how much an encoder and ``J_a q + a_0`` differ [rad]: at the motors of a loaded hand, behind cables
     that stretch by degrees in a pinch of 5 N. Where the stretch is known they differ as joints do."""
-    still: float = 0.02 * _DEG
+    still: float = 0.02 * DEGREE
     """An encoder that moves by less has not moved, a wanted motion below it is none [rad]."""
-    servo: float = 0.1 * _DEG
+    servo: float = 0.1 * DEGREE
     """Of a servo's error from motion to motion [rad]."""
-    dead_zone: float = 1.0 * _DEG
+    dead_zone: float = 1.0 * DEGREE
     """Of a servo's dead zone, before it has moved [rad]."""
-    bias: float = 0.3 * _DEG
+    bias: float = 0.3 * DEGREE
     """Of a servo's bias, before it has moved [rad]."""
-    tendon: float = 0.7 * _DEG
+    tendon: float = 0.7 * DEGREE
     """Of the joints' answer to a motor, from motion to motion [rad]: fingers share the object's motion."""
     coupling: float = 5e-4
     """Play of a rigid coupling [rad]."""

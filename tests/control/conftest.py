@@ -19,8 +19,15 @@ def grasp():
 
 
 @pytest.fixture(scope="module")
-def held():
-    """Another: first observation, axis and kinematic model."""
+def pinch():
+    """Another: plant, kinematic model, first observation."""
     plant = SimulatedHand("icub_right", "box")
     seen = plant.reset(seed=4)
-    return seen, plant.rotation_axis, KinematicModel(plant.hand, plant.object)
+    return plant, KinematicModel(plant.hand, plant.object), seen
+
+
+@pytest.fixture(scope="module")
+def held(pinch):
+    """Its first observation, axis and kinematic model."""
+    plant, model, seen = pinch
+    return seen, plant.rotation_axis, model

@@ -24,11 +24,10 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.qp import ControlProblem
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.exceptions import NonFiniteError, ParameterError, SolverError
+from torch_ekm.exceptions import EKMError, ParameterError, SolverError
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus
-from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
 RULE = StoppingRule(tolerance=0.25 * DEG, stall_window=3, stall_progress=0.1 * DEG, max_steps=5)
@@ -61,13 +60,9 @@ class FrozenPlant(FakePlant):
 
 
 @pytest.fixture(scope="module")
-def held():
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=4)
-    model = KinematicModel(plant.hand, plant.object)
-    axis = plant.rotation_axis
-    loop = LookAndMoveController(model, axis)
-    return seen, axis, loop
+def held(pinch):
+    plant, model, seen = pinch
+    return seen, plant.rotation_axis, LookAndMoveController(model, plant.rotation_axis)
 
 
 def drive(held, change=None, angle: float = 80.0, rule: StoppingRule = RULE):
@@ -151,36 +146,27 @@ def test_object_out_of_reach_of_the_fingers_is_lost(held) -> None:
     assert done.reason is Reason.POSE_JUMP
 
 
-def test_observation_that_is_not_finite_ends_the_loop_with_its_steps(held) -> None:
-    done, _ = drive(held, lambda seen: dataclasses.replace(seen, position=seen.position * math.nan))
-    assert done.reason is Reason.PLANT_FAILED
-    assert isinstance(done.stop.cause, NonFiniteError)
-    assert "Observation.position" in done.stop.message
-    assert len(done.steps) == 1
+SPOILT = {
+    "not finite": (
+        "NonFiniteError: Observation.position",
+        lambda seen: {"position": seen.position * math.nan},
+    ),
+    "one joint short": ("ShapeError: Observation.q must have shape (20,)", lambda seen: {"q": seen.q[:-1]}),
+    "no rotation": ("ParameterError: rotation", lambda seen: {"rotation": 2 * seen.rotation}),
+    "nothing": ("ParameterError: ", None),
+}
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_observation_that_is_one_joint_short_is_named(held) -> None:
-    done, _ = drive(held, lambda seen: dataclasses.replace(seen, q=seen.q[:-1]))
+@pytest.mark.parametrize("what", SPOILT)
+def test_a_reading_that_is_none_ends_the_loop_with_its_steps_and_its_name(held, what: str) -> None:
+    said, spoil = SPOILT[what]
+    done, _ = drive(held, lambda seen: spoil and dataclasses.replace(seen, **spoil(seen)))
     assert done.reason is Reason.PLANT_FAILED
-    assert "ShapeError: Observation.q" in done.stop.message
-    assert "'icub_right'" in done.stop.message
-    assert len(done.steps) == 1
-
-
-def test_a_rotation_that_is_none_ends_the_loop_with_its_steps(held) -> None:
-    done, _ = drive(held, lambda seen: dataclasses.replace(seen, rotation=2 * seen.rotation))
-    assert done.reason is Reason.PLANT_FAILED
-    assert "ParameterError: rotation" in done.stop.message
-    assert len(done.steps) == 1
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_a_plant_that_returns_nothing_ends_the_loop_with_its_steps(held) -> None:
-    done, _ = drive(held, lambda seen: None)
-    assert done.reason is Reason.PLANT_FAILED
-    assert "must be an Observation" in done.stop.message
-    assert repr(done).startswith("<Manipulation: plant failed after 1 motions: ParameterError: ")
+    assert isinstance(done.stop.cause, EKMError)
+    assert repr(done).startswith(f"<Manipulation: plant failed after 1 motions: {said}")
+    assert ("'icub_right'" in done.stop.message) is (what == "one joint short")
+    assert ("must be an Observation" in done.stop.message) is (what == "nothing")
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -19,9 +19,7 @@ from torch_ekm.control import (
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation
-from torch_ekm.simulation import SimulatedHand
 
 DEG = torch.pi / 180
 SAFETY = Safety(StoppingRule(max_steps=12))
@@ -41,23 +39,16 @@ class Pads(HoldingPlant):
         return self.reading(rotation=exp(self.turn) @ self.seen.rotation, fingertip_force=felt)
 
 
-@pytest.fixture(scope="module")
-def held():
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=4)
-    return plant, KinematicModel(plant.hand, plant.object), seen
-
-
-def turned(held, force, learns: bool = False, safety: Safety = SAFETY):
-    plant, model, seen = held
+def turned(pinch, force, learns: bool = False, safety: Safety = SAFETY):
+    plant, model, seen = pinch
     pads, chosen = Pads(seen, force), EnhancedModel.for_grasp(model, seen.state) if learns else model
     loop = ClosedLoop(pads, LookAndMoveController(chosen, plant.rotation_axis), safety=safety)
     return loop.run(PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)), pads
 
 
 @pytest.mark.parametrize("learns", [True, False])
-def test_a_finger_that_bears_nothing_is_gripped_before_the_turn_in_one_movement(held, learns) -> None:
-    done, _ = turned(held, lambda n: [5.0, 2.5, 0.4 if n < 1 else 2.5], learns)
+def test_a_finger_that_bears_nothing_is_gripped_before_the_turn_in_one_movement(pinch, learns) -> None:
+    done, _ = turned(pinch, lambda n: [5.0, 2.5, 0.4 if n < 1 else 2.5], learns)
     assert done.reason is not Reason.WEAK_GRASP
     assert [step.decision.turns for step in done.steps[:2]] == [False, True]
     grips, turn = (step.decision.predicted[-3:].norm() for step in done.steps[:2])
@@ -65,8 +56,8 @@ def test_a_finger_that_bears_nothing_is_gripped_before_the_turn_in_one_movement(
 
 
 @pytest.mark.parametrize("learns", [True, False])
-def test_a_grasp_that_stays_weak_is_declined_with_the_fingers_name(held, learns) -> None:
-    done, _ = turned(held, lambda n: [5.0 + 0.01 * n, 2.5 - 0.01 * n, 0.4], learns)
+def test_a_grasp_that_stays_weak_is_declined_with_the_fingers_name(pinch, learns) -> None:
+    done, _ = turned(pinch, lambda n: [5.0 + 0.01 * n, 2.5 - 0.01 * n, 0.4], learns)
     assert done.reason is Reason.WEAK_GRASP
     assert not done.lost
     assert "finger 'middle' bears 0.4 N of 1." in done.stop.message
@@ -74,8 +65,8 @@ def test_a_grasp_that_stays_weak_is_declined_with_the_fingers_name(held, learns)
     assert not any(step.decision.turns for step in done.steps)
 
 
-def test_without_fingertips_nothing_is_declined(held) -> None:
-    plant, model, seen = held
+def test_without_fingertips_nothing_is_declined(pinch) -> None:
+    plant, model, seen = pinch
     blind = dataclasses.replace(seen, fingertip_force=None)
     weak = LookAndMoveController(model, plant.rotation_axis, limits=[NormalForceLimit(minimum=9.0)])
 
@@ -89,8 +80,8 @@ def test_without_fingertips_nothing_is_declined(held) -> None:
     assert done.reason is not Reason.WEAK_GRASP
 
 
-def test_the_least_force_of_a_finger_follows_from_the_grip(held) -> None:
-    plant, model, seen = held
+def test_the_least_force_of_a_finger_follows_from_the_grip(pinch) -> None:
+    plant, model, seen = pinch
     controller = LookAndMoveController(model, plant.rotation_axis)
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=5.0)
     grip = controller.decide(seen.state, seen.a, target, seen.fingertip_force).grip
@@ -102,13 +93,13 @@ def test_the_least_force_of_a_finger_follows_from_the_grip(held) -> None:
 
 
 @pytest.mark.parametrize(("force", "believed"), [([5.0, 2.5, 2.5], False), ([2.0, 5.0, 0.0], True)])
-def test_a_pose_that_jumps_is_the_objects_where_the_grip_changes_with_it(held, force, believed) -> None:
+def test_a_pose_that_jumps_is_the_objects_where_the_grip_changes_with_it(pinch, force, believed) -> None:
     class Jumps(Pads):
         def move(self, delta_a: torch.Tensor) -> None:
             super().move(delta_a)
-            self.turn = (len(self.commands) == 2) * 65 * DEG * held[0].rotation_axis
+            self.turn = (len(self.commands) == 2) * 65 * DEG * pinch[0].rotation_axis
 
-    plant, model, seen = held
+    plant, model, seen = pinch
     rule = dataclasses.replace(SAFETY.rule, off_limit=100 * DEG)
     pads = Jumps(seen, lambda n: force if n == 2 else [5.0, 2.5, 2.5])
     loop = ClosedLoop(pads, LookAndMoveController(model, plant.rotation_axis), safety=Safety(rule))

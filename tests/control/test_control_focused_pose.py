@@ -52,7 +52,7 @@ def target(degrees: float = 0.0, millimetres: float = 0.0) -> PoseTarget:
         (lambda: Direction(X, "mm", tolerance=0.0), ParameterError, "tolerance"),
         (lambda: Direction(X, "mm", step=math.nan), ParameterError, "step"),
         (lambda: Direction(X, "mm", weight=-1.0), ParameterError, "weight"),
-        (lambda: FocusedPose([Direction(X, "mm"), Direction(-2 * X, "mm")]), ParameterError, "named once"),
+        (lambda: FocusedPose([Direction(X, "mm"), Direction(-2 * X, "mm")]), ParameterError, "perpendicular"),
         (lambda: FocusedPose([Direction(X, "mm"), Direction(X + Y, "mm")]), ParameterError, "perpendicular"),
         (lambda: FocusedPose([]), ParameterError, "one to six"),
         (lambda: FocusedPose(Direction(X, "mm")), ParameterError, "a list of one to six Directions"),
@@ -69,6 +69,10 @@ def target(degrees: float = 0.0, millimetres: float = 0.0) -> PoseTarget:
         (lambda: PoseTarget(X, 2 * torch.eye(3)), ParameterError, "a rotation matrix"),
         (lambda: FocusedPose(torch.ones(1, 6) / 6**0.5), ParameterError, "turns or shifts"),
         (lambda: PoseTarget.moved(HERE, X, millimetres=math.inf), NonFiniteError, "millimetres"),
+        (lambda: FocusedPose(torch.eye(5)), ShapeError, "matrix"),
+        (lambda: FocusedPose.rotation_about(0 * X), ParameterError, "non-zero"),
+        (lambda: PoseTarget.turned(HERE, X, math.nan), NonFiniteError, "angle"),
+        (lambda: StoppingRule(max_steps=0), ParameterError, "max_steps"),
         (lambda: EffortTask(0.0), ParameterError, "positive"),
         (lambda: EffortTask(((1.0, 2.0), (2.0, 1.0))), ParameterError, "positive definite"),
         (lambda: EffortTask(((1.0, 0.0),)), ParameterError, "positive definite"),
@@ -85,6 +89,19 @@ def test_lists_and_single_precision_are_taken() -> None:
     focus = FocusedPose([Direction([0, 0, 1], "deg"), Direction(X.float(), "mm")])
     assert focus.error(by, HERE) == TURN_AND_SHIFT.error(target(5.0), HERE)
     assert focus.error(at, HERE) == pytest.approx(0.0, abs=1e-12)  # turned about y alone
+
+
+def test_error_of_a_turned_pose_is_the_turn() -> None:
+    twist = PoseTarget.turned(HERE, 3 * (0.6 * X + 0.8 * Z), 0.4).error(HERE)
+    torch.testing.assert_close(twist, torch.tensor([0, 0, 0, 0.24, 0, 0.32], dtype=torch.float64))
+
+
+def test_focus_and_rest_span_all_directions() -> None:
+    focus = FocusedPose.rotation_about(0.6 * X + 0.8 * Z)
+    rows = torch.cat([focus.matrix, focus.off_matrix])
+    torch.testing.assert_close(rows @ rows.mT, torch.eye(6, dtype=torch.float64))
+    assert len(focus.matrix) == 1
+    assert focus.off_translation.tolist() == [True] * 3 + [False] * 2
 
 
 def test_a_turn_and_a_shift_are_named_by_their_units() -> None:
@@ -266,3 +283,19 @@ def test_what_is_called_reachable_is_reached(tin, asked: str) -> None:
     wrong = done.focus.matrix @ there.error(done.stop.final.truth.state)
     for one, error in zip(directions, wrong.abs().tolist(), strict=True):
         assert error < (0.3 * DEG if one.unit == "deg" else 0.25e-3)
+
+
+@pytest.mark.parametrize(
+    ("errors", "limited", "reason"),
+    [
+        ([1.0], False, StopReason.RUNNING),
+        ([1.0, 0.05], False, StopReason.RUNNING),  # looks decide on that
+        ([1.0, 0.5, 0.49, 0.51, 0.5], False, StopReason.STALLED),
+        ([1.0, 0.5, 0.49, 0.51, 0.5], True, StopReason.ACTUATOR_LIMITS),
+        ([1.0, 0.8, 0.6, 0.4, 0.3], False, StopReason.RUNNING),
+        ([3.0 - 0.1 * k for k in range(11)], False, StopReason.STEP_LIMIT),
+    ],
+)
+def test_stopping_rule(errors: list[float], limited: bool, reason: StopReason) -> None:
+    rule = StoppingRule(tolerance=0.1, stall_window=3, stall_progress=0.05, max_steps=10)
+    assert rule.judge(errors, limited) is reason

@@ -12,22 +12,13 @@ import torch
 from torch_ekm.control import GripForceTask, LookAndMoveController, PoseTarget, Situation, StepBound
 from torch_ekm.control.limiting import grip_share
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.model import KinematicModel
-from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
 
 
-@pytest.fixture(scope="module")
-def held():
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=4)
-    return plant, KinematicModel(plant.hand, plant.object), seen
-
-
-def test_the_grip_follows_from_weight_friction_and_lever(held) -> None:
+def test_the_grip_follows_from_weight_friction_and_lever(pinch) -> None:
     """``f = 2.5/mu (m g/2 + 95 r)``: 80 g, mu = 0.9, contacts about 15 mm from the axis."""
-    plant, model, seen = held
+    plant, model, seen = pinch
     lin = model.linearize(seen.state)
     task, axis = GripForceTask(least=1.0), LookAndMoveController(model, plant.rotation_axis).focus
     force = seen.fingertip_force
@@ -45,8 +36,8 @@ def test_the_grip_follows_from_weight_friction_and_lever(held) -> None:
     assert GripForceTask(force=4.0).wanted(lin, tighter) == 4.5
 
 
-def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> None:
-    plant, model, seen = held
+def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(pinch) -> None:
+    plant, model, seen = pinch
     controller = LookAndMoveController(model, plant.rotation_axis)
     lin, focus = model.linearize(seen.state), controller.focus
     on = torch.zeros(6, dtype=torch.float64)
@@ -74,8 +65,8 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(held) -> N
     assert 0 < shares[1] < shares[0] < 1
 
 
-def test_a_measured_grip_that_is_too_weak_is_tightened_and_not_turned(held) -> None:
-    plant, model, seen = held
+def test_a_measured_grip_that_is_too_weak_is_tightened_and_not_turned(pinch) -> None:
+    plant, model, seen = pinch
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
     felt = torch.tensor([2.9, 1.4, 1.4, 0.0, 0.0], dtype=torch.float64)
     decision = LookAndMoveController(model, plant.rotation_axis).decide(seen.state, seen.a, target, felt)
@@ -84,8 +75,8 @@ def test_a_measured_grip_that_is_too_weak_is_tightened_and_not_turned(held) -> N
     assert float(change[0]) > 0.3  # [N]
 
 
-def test_the_bound_shortens_the_step_that_is_made(held) -> None:
-    plant, model, seen = held
+def test_the_bound_shortens_the_step_that_is_made(pinch) -> None:
+    plant, model, seen = pinch
     target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
     whole, cut = (
         LookAndMoveController(model, plant.rotation_axis, bound=bound).decide(

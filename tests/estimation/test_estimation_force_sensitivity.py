@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 
-from torch_ekm._noise import NOISE
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import NonFiniteError, ShapeError
 
@@ -47,16 +46,6 @@ def test_it_scales_what_a_stiffer_description_says_everywhere() -> None:
     S = torch.tensor([[10.0, -20.0, 5.0]], dtype=F64)
     assert float(learner.scale) == pytest.approx(0.4, abs=0.03)
     torch.testing.assert_close(learner.corrected(S, [0]), 0.4 * S, atol=1.0, rtol=0)
-
-
-def test_without_forgetting_it_is_regularised_least_squares(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torch_ekm.estimation.force_sensitivity._FORGETTING", 1.0)
-    monkeypatch.setattr("torch_ekm.estimation.force_sensitivity._RECENT", 0.0)
-    true, w = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), moves(8)
-    learner = taught(true, torch.zeros_like(true), w)
-    y, s, p = w @ true[0], NOISE.force, 20.0
-    exact = torch.linalg.solve(w.mT @ w / s**2 + torch.eye(3, dtype=F64) / p**2, w.mT @ y / s**2)  # S = 0
-    torch.testing.assert_close(learner.correction[0], exact)
 
 
 def test_motions_in_one_direction_do_not_fade_what_others_said() -> None:
@@ -101,25 +90,6 @@ def test_bad_input_changes_nothing_and_the_state_dict_carries_all(unchecked) -> 
     for each in (learner, other):
         each.update(moves(1, seed=9)[0], torch.ones(2, dtype=F64), nothing, 0.1)
     assert torch.equal(other.correction, learner.correction)
-
-
-def test_what_is_not_explained_is_measured() -> None:
-    true, described = torch.tensor([[5.0, -3.0, 2.0]], dtype=F64), torch.full((1, 3), 2.0, dtype=F64)
-    noisy = taught(true, described, moves(80), noise=0.8)
-    assert float(noisy.variance.sqrt()) == pytest.approx(0.8, rel=0.4)
-    torch.testing.assert_close(
-        noisy.corrected(described, [0]), noisy.scale[:, None] * described + noisy.correction
-    )
-
-
-def test_a_pad_that_joins_later_learns_as_fast_as_the_first() -> None:
-    true, described = torch.full((2, 3), 5.0, dtype=F64), torch.zeros(2, 3, dtype=F64)
-    learner, w = ForceSensitivity(2, 3), moves(112)
-    for k, one in enumerate(w):
-        change = true @ one
-        change[1] = NAN if k < 100 else change[1]
-        learner.update(one, change, described @ one, 0.0)
-    torch.testing.assert_close(learner.correction, true, atol=1.0, rtol=0)
 
 
 def test_what_is_lost_as_the_object_turns_either_way_is_no_answer_to_the_actuators() -> None:

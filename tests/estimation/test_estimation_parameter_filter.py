@@ -38,16 +38,6 @@ def teach(learner: ParameterFilter, stream, noise: float = 0.05):
     return [learner.update(y - phi @ learner.mean, phi, R) for phi, y in stream]
 
 
-def test_of_a_linear_model_it_is_bayes_rule(monkeypatch) -> None:
-    monkeypatch.setattr("torch_ekm.estimation.parameter_filter._DRIFT", 0.0)
-    learner, seen = made(), list(motions(12))
-    teach(learner, seen)
-    phi, y = torch.cat([p for p, _ in seen]), torch.cat([y for _, y in seen])
-    precision = phi.mT @ phi / 0.05**2 + torch.eye(2, dtype=F64)
-    torch.testing.assert_close(learner.mean, torch.linalg.solve(precision, phi.mT @ y / 0.05**2))
-    torch.testing.assert_close(learner.covariance, torch.linalg.inv(precision))
-
-
 def test_one_outlier_moves_little_and_two_are_a_change() -> None:
     learner = made()
     teach(learner, motions(30))

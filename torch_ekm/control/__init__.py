@@ -8,6 +8,7 @@ from .bands import Bands
 from .closed_loop import ClosedLoop
 from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
 from .decision import Band, Decision, Piece, StopReason
+from .ends import Safety, StoppingRule
 from .focus import Direction, FocusedPose, PoseTarget
 from .journal import Journal
 from .knowledge import HandKnowledge
@@ -19,7 +20,7 @@ from .plan import OneStep, Plan, Planner, Waypoint, WholeTurn
 from .qp import Bounds, Equality, Inequality, Squares
 from .reach import Reach, Reachability
 from .rehearsal import End, PathEnd
-from .safety import Guards, Safety, StoppingRule
+from .safety import Guards
 from .situation import LinearizedModel, Situation
 from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 

@@ -20,17 +20,16 @@ from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
 from .controller import LookAndMoveController
 from .decision import Decision, Expectation, StopReason
-from .ends import Ends, hindrances
+from .ends import Ends, Safety, failed
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
 from .learned import Learned
 from .lessons import Lessons
 from .manipulation import Manipulation, Step, Stop
 from .plan import OneStep, Plan, Planner, WholeTurn
-from .reach import Reach, Reachability, out_of_reach, reach, reachability
-from .safety import Safety
+from .reach import Reach, Reachability, reach, reachability
+from .safety.guards import Objection
 from .safety.on_the_way import OnTheWay
-from .safety.safety import Objection
 from .safety.watch import Watch
 
 _GRIPS, _AGAIN = 2, 4  # movements that only grip, before the first turn and in all, one after each turn
@@ -191,7 +190,7 @@ class ClosedLoop:
                 self.hold()
                 if last is None or not (error is failure or isinstance(error, KeyboardInterrupt)):
                     raise
-                return Stop.failed(error, last)
+                return failed(error, last)
             except BaseException:  # a closed generator as well: the hand must not go on
                 self.hold()
                 raise
@@ -204,7 +203,7 @@ class ClosedLoop:
         self.knowledge.error.begin()
         self.controller.tighter = float(self.knowledge.error.tighter)
         self._figures.begin(seen.a)
-        ends = Ends(self.safety.rule, target, self.controller.focus, seen)
+        ends = Ends(self.safety.rule, target, self.controller, seen)
         grips = turns = 0
         decision = None
         while True:
@@ -212,20 +211,11 @@ class ClosedLoop:
                 self.hold()
                 return Stop(halt.reason, seen, halt.message)
             seen, looks = self._look(seen, ends, watch)
-            over = ends.over(seen, looks)
+            over = ends.over(seen, looks, decision, self._stop.is_set(), self.decline)
             if over is not None:
-                why = over.message
                 if over.reason is StopReason.OBJECT_LOST:
                     self.knowledge.error.slid(lost=True)
-                if over.reason is StopReason.STALLED:
-                    why = hindrances(seen, decision, self.controller.kinematic)
-                return Stop(over.reason, seen, why)
-            if self._stop.is_set():
-                return Stop(StopReason.STOPPED, seen)
-            if self.decline and decision is None and seen.status is PlantStatus.HELD:
-                against = out_of_reach(self.controller, seen, target)
-                if against:
-                    return Stop(StopReason.OUT_OF_REACH, seen, against)
+                return Stop(over.reason, seen, over.message)
             began = time.perf_counter()
             if turns:
                 firm = _LEAST if grips < _AGAIN and decision is not None and decision.turns else 0.0
@@ -235,11 +225,8 @@ class ClosedLoop:
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
                 said = "; ".join(filter(None, (decision.message, plan.end.message)))
-                return Stop(decision.status, seen, said + ends.surprise + watch.suspects(seen))
-            weak = "" if turns or not decision.turns else watch.weak(decision, seen)
-            if weak:
-                return Stop(StopReason.WEAK_GRASP, seen, weak)
-            halt = watch.command(decision, seen)
+                return Stop(decision.status, seen, said + ends.surprise + watch.motions.suspects(seen))
+            halt = watch.command(decision, seen, first=decision.turns and not turns)
             if halt is not None:
                 continue
             step, halt = self._move(seen, decision, ends, watch, seconds)
@@ -278,7 +265,6 @@ class ClosedLoop:
         increment, pull = after.state.minus(seen.state), after.a - seen.a
         if halt is None and after.status is not PlantStatus.LOST:  # else nobody learns from this reading
             moved = pull
-            self.knowledge.checkpoint()
             if verdict.encoders:
                 self.plant.learn(after)
             halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)

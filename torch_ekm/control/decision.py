@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
+from .._noise import DEGREE
 from ..kinematics import GraspState
 from ..typing import Float, Tensor
 
 if TYPE_CHECKING:
     from ..model import Linearization
-
-_DEG = math.pi / 180
 
 
 class StopReason(Enum):
@@ -112,7 +111,7 @@ class Band:
     force_std: Float[Tensor, " n_pads"] | None
 
     def __str__(self) -> str:
-        text = f"{self.off / _DEG:.1f} +- {self.off_std / _DEG:.1f} deg off the axis"
+        text = f"{self.off / DEGREE:.1f} +- {self.off_std / DEGREE:.1f} deg off the axis"
         if self.force is None or self.force_std is None:
             return text
         pairs = zip(self.force.tolist(), self.force_std.tolist(), strict=True)

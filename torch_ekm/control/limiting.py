@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from .._noise import DEGREE
 from ..exceptions import ParameterError
 from ..kinematics.se3 import hat
 from ..typing import Float, Tensor
@@ -17,7 +18,6 @@ from .situation import Situation
 if TYPE_CHECKING:
     from ..model import Linearization
 
-_DEG = math.pi / 180
 WEAK, FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
 
 
@@ -32,7 +32,7 @@ class LimitingFunction:
     gain: float = 0.8
     """Share of a small focused error that one step asks for. A model that is right meets all of it,
     camera noise included; below 1 the loop averages the noise over some steps."""
-    step: float = 2.5 * _DEG
+    step: float = 2.5 * DEGREE
     """At most this much of the focused error is asked for [rad]; at 2.5 deg each direction's own step."""
     contact_travel: float | None = 1.2e-3
     """And no contact is asked to move farther than this [m]: a wide object turns in smaller steps.
@@ -75,7 +75,7 @@ class StepBound:
        measure it, there are none.
     """
 
-    off_rotation: float = 1.5 * _DEG
+    off_rotation: float = 1.5 * DEGREE
     """[rad]"""
     off_travel: float = 2.5e-3
     """[m]"""

@@ -11,8 +11,9 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from .._noise import DEGREE
 from ..exceptions import ParameterError, UnknownNameError
-from .qp import DEGREE, Array, Bounds, Inequality, as_array
+from .qp import Array, Bounds, Inequality, as_array
 from .situation import LinearizedModel, Situation, grip_shares
 
 

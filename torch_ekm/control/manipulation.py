@@ -6,7 +6,6 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from ..exceptions import CommandRefusedError
 from ..plant import Observation
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
@@ -47,15 +46,6 @@ class Stop(NamedTuple):
         if more in self.message:
             return self
         return self._replace(message="; ".join(filter(None, (self.message, more))))
-
-    @classmethod
-    def failed(cls, error: BaseException, final: Observation) -> Stop:
-        """What the plant raised, or the gate before it, or Ctrl-C."""
-        if isinstance(error, KeyboardInterrupt):
-            return cls(StopReason.STOPPED, final, "Ctrl-C", error)
-        refused = isinstance(error, CommandRefusedError)
-        reason = StopReason.COMMAND_REFUSED if refused else StopReason.PLANT_FAILED
-        return cls(reason, final, f"{type(error).__name__}: {error}", error)
 
 
 @dataclass(frozen=True)

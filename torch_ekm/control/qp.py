@@ -1,23 +1,24 @@
-"""The controller's quadratic program: rows in, one function sums them, another solves the sum."""
+"""The controller's quadratic program: rows in, one function sums them, another solves the sum.
+
+It is solved for u in degrees: of the order of 1, like its rows.
+"""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from math import pi
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .._extras import require
+from .._noise import DEGREE
 from ..contact.forces.active_set import EqualityProgram, solve_by_active_set
 from ..exceptions import NonFiniteError, ParameterError, ShapeError, SolverError
 from ..typing import Array, Tensor
 
 Numbers = Tensor | Array | float
-
-DEGREE = pi / 180  #: the program is solved for u in degrees: of the order of 1, like its rows
 
 
 class Squares(NamedTuple):
@@ -161,15 +162,12 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
     lower, upper = np.full(n_u, -np.inf), np.full(n_u, np.inf)
     reached: list[tuple[Array, Array, Array]] = [(np.zeros((0, n_u)), np.zeros(0), np.zeros(0))]
     kept = reached.copy()
-    for row in rows:
-        if row is not None and not isinstance(row, Rows):
+    for row in (row for row in rows if row is not None):
+        if not isinstance(row, Rows):
             raise ParameterError("rows", type(row).__name__, "Squares, Equality, Inequality, Bounds or None")
-        if row is not None:
-            _check(row, n_u)
+        _check(row, n_u)
         if isinstance(row, Squares):
             unit, weight = as_array(row.unit).reshape(-1, 1), as_array(row.weight).reshape(-1, 1)
-            if (weight < 0).any():
-                raise ParameterError("weight", row.weight, "at least 0: the program is convex")
             A, b = as_array(row.A) * DEGREE / unit, as_array(row.b) / unit[:, 0]
             twice = 2 * A.T
             P += twice @ (weight * A)
@@ -180,20 +178,14 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
         elif isinstance(row, Inequality):
             h = as_array(row.h) / row.unit
             kept.append((as_array(row.C) * (DEGREE / row.unit), h, np.full(len(h), row.penalty)))
-        elif row is not None:
+        else:
             lower = np.maximum(lower, as_array(row.lower) / DEGREE)
             upper = np.minimum(upper, as_array(row.upper) / DEGREE)
     crossed = np.flatnonzero(lower > upper)
     if crossed.size:
         i = int(crossed[0])
         raise ParameterError(f"lower[{i}]", lower[i] * DEGREE, f"at most upper[{i}] = {upper[i] * DEGREE}")
-
-    E, d, rho = _stack(reached)
-    C, h, rho_t = _stack(kept)
-    for name, value in (("cost", P), ("cost", q), ("equality", E), ("equality", d), ("rows", C), ("rows", h)):
-        if not np.isfinite(value).all():
-            raise NonFiniteError(name)
-    return ControlProblem(P, q, (E, d, rho), (C, h, rho_t), (lower, upper))
+    return ControlProblem(P, q, _stack(reached), _stack(kept), (lower, upper))
 
 
 def _check(row: Rows, n_u: int) -> None:
@@ -211,7 +203,9 @@ def _check(row: Rows, n_u: int) -> None:
         raise ShapeError(f"{row._fields[1]} of {kind}", f"{A.shape[:-1]}", b.shape, "one entry for each row")
     if isinstance(row, Squares | Inequality) and not (as_array(row.unit) > 0).all():
         raise ParameterError(f"unit of {kind}", row.unit, "greater than 0")
-    if not (np.isfinite(A).all() and np.isfinite(b).all()):
+    if isinstance(row, Squares) and not (as_array(row.weight) >= 0).all():
+        raise ParameterError("weight", row.weight, "at least 0: the program is convex")
+    if not all(np.isfinite(as_array(value)).all() for value in row):
         raise NonFiniteError(f"{row._fields[0]}, {row._fields[1]} of {kind}")
 
 

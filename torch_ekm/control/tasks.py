@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from .._noise import DEGREE
 from ..exceptions import ParameterError, ShapeError
 from .limiting import contact_travel
-from .qp import DEGREE, Equality, Squares, as_array
+from .qp import Equality, Squares, as_array
 from .situation import LinearizedModel, Situation, grip_shares
 
 if TYPE_CHECKING:

@@ -124,11 +124,7 @@ class EnhancedModel(Recorded, nn.Module):
         if not isinstance(learner, ResidualLearner):
             adapts = model.figures is not None and model.figures.learns
             made = partial(grasp_learner, adapts=adapts) if learner is None else learner
-            if not callable(made):
-                raise ParameterError(
-                    "learner", made, "a ResidualLearner, or a function (n_s, n_a) that makes one"
-                )
-            learner = made(encode.n_features, n_a)
+            learner = made(encode.n_features, n_a) if callable(made) else made
         check_kind(
             "learner", learner, ResidualLearner, "a ResidualLearner, or a function (n_s, n_a) that makes one"
         )

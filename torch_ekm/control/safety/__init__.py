@@ -2,6 +2,4 @@
 
 from __future__ import annotations
 
-from .safety import Guards as Guards
-from .safety import Safety as Safety
-from .safety import StoppingRule as StoppingRule
+from .guards import Guards as Guards

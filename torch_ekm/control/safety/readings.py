@@ -1,26 +1,27 @@
-"""What speaks against a reading: age, range, jumps, and its innovation against the covariance."""
+"""What speaks against one reading: age, range, jumps, and its innovation against the covariance."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
+from ..._noise import DEGREE, NOISE
 from ...plant import Observation, PlantStatus
 from ...typing import Array, Tensor
-from ..decision import Expectation, StopReason
-from .fingertips import hold
-from .safety import Guards, Objection
+from ..decision import Expectation
+from .guards import Effect, Guards, Objection, check, gravest
 
 if TYPE_CHECKING:
     from ...description import HandDescription
     from ..focus import FocusedPose
 
-_DEG = math.pi / 180
-_NAMES = ("the encoders' reading", "the joints' reading", "the object's pose")
-_AGAINST = -0.5  # share of a command that the encoders made, from which they went the other way
+_SENSORS = {
+    "encoders": "the encoders' reading", "joints": "the joints' reading", "pose": "the object's pose",
+}  # fmt: skip
+AGAINST = 0.3  # share of a motion that is made the other way; healthy hands make .4 of it and more
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
 
 
@@ -34,33 +35,23 @@ class ReadingTests:
 
     def __init__(self, guards: Guards, hand: HandDescription) -> None:
         self.guards, self.hand = guards, hand
-        self._raw: Observation | None = None
+        self._last: Observation | None = None
         self._still: Observation | None = None  # since which the encoders read the same, bit by bit
-        self._path = {"joints": 0.0, "pose": 0.0}
-        self._limits = [
-            ("encoder", hand.actuator_names, hand.actuator_lower, hand.actuator_upper),
-            ("joint", hand.joint_names, hand.joint_lower, hand.joint_upper),
-        ]
+        self._path = {"joints": 0.0, "pose": 0.0}  # way of the encoders since these read something else
 
     def at_rest(self, seen: Observation, before: Observation | None = None) -> Objection | None:
         """Of a reading without a motion since ``before``."""
-        doubt = self._age(seen) or self.motors(before, None, seen)
-        if before is None or doubt is not None:
-            return doubt
-        if before.dated and seen.time < before.time:
-            message = f"the clock went back from {before.time:.3f} to {seen.time:.3f} s: check the driver"
-            return Objection(StopReason.STALE_SENSOR, message)
-        ds = seen.state.minus(before.state).numpy()
-        return self._jump(ds, 0 * ds, seen)
+        said = [*self._ages(seen, None), *self._motors(before, None, seen)]
+        if before is not None:
+            back = before.time - seen.time if before.dated else 0.0
+            said += check("clock", back, 0.0, began=before.time, time=seen.time)
+            ds = seen.state.minus(before.state).numpy()
+            said += self._jumps(ds, 0 * ds, seen)
+        return gravest(said)
 
     def motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> Objection | None:
         """Ranges, and encoders after the motors were sent by ``sent`` [rad]; None: nowhere."""
-        doubt = self._range(seen)
-        if before is None or doubt is not None:
-            return doubt
-        if sent is None:
-            return self._encoders(before, 0 * seen.a, seen, self.guards.unchanged)
-        return self._encoders(before, sent, seen) or self._against(before, sent, seen)
+        return gravest(self._motors(before, sent, seen))
 
     def after_motion(
         self,
@@ -70,175 +61,119 @@ class ReadingTests:
         expected: Expectation | None,
         blind: int,
     ) -> Objection | None:
-        """Of a reading after the motors were sent by ``sent`` [rad], the worst first; ``blind`` motions
-        without a pose came before."""
-        doubt = self._age(seen, before)
-        if doubt is None or doubt.blind:  # the camera alone: the rest is still looked at
-            doubt = self.motors(before, sent, seen) or self._speed(before, seen) or doubt
-        if expected is None or (doubt is not None and not doubt.blind):
-            return doubt
-        ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
-        if doubt is not None:  # blind: the joints are still looked at
-            ds[-6:] = predicted[-6:]
-            return self._jump(ds, predicted, seen) or doubt
-        return self._jump(ds, predicted, seen) or self._gate(before, ds, expected, seen, blind)
+        """Of a reading after the motors were sent by ``sent`` [rad], the gravest; ``blind`` motions without a
+        pose came before."""
+        said = self._ages(seen, before)
+        unseen = bool(said)  # the rest is still looked at
+        said += [*self._motors(before, sent, seen), *self._speed(before, seen)]
+        if expected is not None:
+            ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
+            said += self._jumps(ds, predicted, seen, unseen)
+            said += [] if unseen else self._gate(before, ds, expected, seen, blind)
+        return gravest(said)
 
-    def _age(self, seen: Observation, before: Observation | None = None) -> Objection | None:
-        """Stale, repeated or missing readings."""
-        taken, repeats = seen.taken, self._repeats(seen, before)
-        if before is not None and torch.equal(seen.a, before.a):
-            if all(self._same(seen).values()):
-                message = "encoders, joints and pose are the same bit by bit after a motion: check the driver"
-                return Objection(StopReason.STALE_SENSOR, message)
-            if self._still is not None and self._hand_moved(self._still, seen):
-                message = "encoders are the same bit by bit while joints and object moved: check their driver"
-                return Objection(StopReason.STALE_SENSOR, message)
-        for k, sensor in enumerate(taken._fields[:3]):  # fingertips: another reading stands in
-            age, oldest = seen.time - taken[k], self.guards.max_age[k]
-            problem = ""
-            if before is not None and sensor == "pose" and seen.status is PlantStatus.NOT_SEEN:
-                message = "the camera does not find the object: clear its view, or light it"
-                return Objection(StopReason.BLIND, message, blind=True)
-            if sensor in repeats:
-                problem = f"is the same bit by bit while the encoders moved {deg(repeats[sensor])}"
-            elif not seen.dated:
-                continue
-            elif before is not None and before.dated and taken[k] <= before.time:
-                problem = f"was read at {taken[k]:.3f} s, before the motion that began at {before.time:.3f} s"
-            elif abs(age) > oldest:
-                problem = f"is {age:.3f} s old, Guards.max_age is {oldest:g} s"
-            if problem:
-                message = f"{_NAMES[k]} {problem}: check its driver or its time stamps"
-                return Objection(
-                    StopReason.STALE_SENSOR, message, blind=sensor == "pose" and before is not None
+    def _ages(self, seen: Observation, before: Observation | None) -> list[Objection]:
+        """Stale, repeated or missing readings; of fingertips another reading stands in."""
+        said, same, moved = [], self._same(seen), 0.0
+        if before is not None:
+            moved = float((seen.a - before.a).abs().max())
+            if moved == 0:
+                said += check("all repeat", all(same.values()), 0)
+                said += check(
+                    "encoders repeat", self._still is not None and self._moved(self._still, seen), 0
                 )
-        return None
+            said += check("not seen", seen.status is PlantStatus.NOT_SEEN, 0)
+        for k, (sensor, what) in enumerate(_SENSORS.items()):
+            way = self._path[sensor] + moved if before is not None and same.get(sensor) else 0.0
+            found = check("repeats", way, self.guards.unchanged, {"way": way}, what=what)
+            if seen.dated:
+                taken, age = seen.taken[k], seen.time - seen.taken[k]
+                if before is not None and before.dated:
+                    late = taken <= before.time
+                    found += check("before", late, 0, what=what, taken=taken, began=before.time)
+                found += check("age", abs(age), self.guards.max_age[k], what=what, age=age)
+            if sensor == "pose" and before is not None:
+                found = [one._replace(effect=Effect.BLIND) for one in found]
+            said += found
+        return said
 
-    def _hand_moved(self, one: Observation, other: Observation) -> bool:
+    def _moved(self, one: Observation, other: Observation) -> bool:
         """More than noise, and not the object alone, which may have slid."""
         joint = float((other.q - one.q).abs().max())
         return joint > math.sqrt(2) * self.guards.joint_noise and not agree(one, other, self.guards)
 
-    def _repeats(self, seen: Observation, before: Observation | None) -> dict[str, float]:
-        """Sensors that stand still bit by bit, and how far the encoders went meanwhile [rad]."""
-        if before is None:
-            return {}
-        same = self._same(seen)
-        if not any(same.values()):
-            return {}
-        moved = float((seen.a - before.a).abs().max())
-        path = {sensor: way + moved for sensor, way in self._path.items() if same[sensor]}
-        return {sensor: way for sensor, way in path.items() if way > self.guards.unchanged}
-
-    def _range(self, seen: Observation) -> Objection | None:
-        for (what, names, lower, upper), value in zip(self._limits, (seen.a, seen.q), strict=True):
-            value = value.detach().cpu().double().numpy()
-            beyond = (lower - value).clip(min=value - upper)
+    def _motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> list[Objection]:
+        hand, guards, said = self.hand, self.guards, []
+        for what, names, lower, upper, value in (
+            ("encoder", hand.actuator_names, hand.actuator_lower, hand.actuator_upper, seen.a),
+            ("joint", hand.joint_names, hand.joint_lower, hand.joint_upper, seen.q),
+        ):
+            read = value.detach().cpu().double().numpy()
+            beyond = (lower - read).clip(min=read - upper)
             i = int(beyond.argmax())
-            if beyond[i] > self.guards.beyond:
-                message = (
-                    f"{what} '{names[i]}' reads {deg(value[i])}, its range is {deg(lower[i])} "
-                    f"to {deg(upper[i])} (Guards.beyond is {deg(self.guards.beyond)}): check it"
-                )
-                return Objection(StopReason.OUT_OF_RANGE, message)
-        return None
+            angles = {"angle": read[i], "lower": lower[i], "upper": upper[i], "most": guards.beyond}
+            said += check("range", beyond[i], guards.beyond, angles, what=what, name=names[i])
+        if before is None:
+            return said
+        moved, v = (seen.a - before.a).numpy(), np.zeros(len(seen.a)) if sent is None else sent.numpy()
+        most = guards.unchanged if sent is None else guards.encoder_jump
+        away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))  # further than sent, or back
+        i = int(away.argmax())
+        angles = {"went": moved[i], "sent": v[i], "most": most}
+        said += check("encoder jump", away[i], most, angles, name=hand.actuator_names[i])
+        if abs(v).max() >= guards.unchanged:
+            share, i = float(moved @ v) / float(v @ v), int((moved * v).argmin())
+            angles, name = {"went": moved[i], "sent": v[i]}, hand.actuator_names[i]
+            said += check("encoders against", -share, AGAINST, angles, share=share, name=name)
+        return said
 
-    def _encoders(
-        self, before: Observation, sent: Tensor, seen: Observation, limit: float | None = None
-    ) -> Objection | None:
-        """An encoder that went further than it was sent, or back."""
-        moved, v, limit = (seen.a - before.a).numpy(), sent.numpy(), limit or self.guards.encoder_jump
-        away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))
-        i, names = int(away.argmax()), self.hand.actuator_names
-        if away[i] > limit:
-            message = (
-                f"encoder '{names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
-                f"({deg(limit)} more are allowed, Guards.encoder_jump): check its cable and zero"
-            )
-            return Objection(StopReason.ENCODER_JUMP, message)
-        return None
-
-    def _against(self, before: Observation, sent: Tensor, seen: Observation) -> Objection | None:
-        """Encoders that went the other way."""
-        moved, v = (seen.a - before.a).numpy(), sent.numpy()
-        share, i = float(moved @ v) / max(float(v @ v), 1e-12), int((moved * v).argmin())
-        if abs(v).max() < self.guards.unchanged or share > _AGAINST:
-            return None
-        message = (
-            f"encoders made {share:.1f} of the motion that was commanded (limit {_AGAINST:g}): "
-            f"'{self.hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were: a sign of the "
-            "motors or of their encoders is wrong; see 'torch-ekm check --plant'"
-        )
-        return Objection(StopReason.WRONG_WAY, message)
-
-    def _speed(self, before: Observation, seen: Observation) -> Objection | None:
-        moved, names = (seen.a - before.a).numpy(), self.hand.actuator_names
+    def _speed(self, before: Observation, seen: Observation) -> list[Objection]:
+        if not (seen.dated and before.dated):
+            return []
+        moved, most = (seen.a - before.a).numpy(), self.guards.speed
         seconds, i = seen.taken.encoders - before.taken.encoders, int(abs(moved).argmax())
-        if seen.dated and before.dated and abs(moved[i]) > self.guards.speed * max(seconds, 0.0):
-            message = (
-                f"encoder '{names[i]}' went {deg(moved[i])} in {seconds:.3g} s (Guards.speed is "
-                f"{deg(self.guards.speed)}/s): the driver must wait for the end of a motion, and date it"
-            )
-            return Objection(StopReason.SPEED_CEILING, message)
-        return None
+        angles, name = {"went": moved[i], "most": most}, self.hand.actuator_names[i]
+        return check("speed", abs(moved[i]), most * max(seconds, 0.0), angles, name=name, seconds=seconds)
 
-    def _jump(self, ds: Array, predicted: Array, seen: Observation) -> Objection | None:
-        """What no motion does."""
-        guards, n_q = self.guards, self.hand.n_q
-        off = ds - predicted
+    def _jumps(self, ds: Array, predicted: Array, seen: Observation, unseen: bool = False) -> list[Objection]:
+        """What no motion does; of a pose that is not seen: nothing."""
+        guards, off, n_q = self.guards, ds - predicted, self.hand.n_q
         i = int(abs(off[:n_q]).argmax())
-        if abs(off[i]) > guards.joint_jump:
-            message = (
-                f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(predicted[i])} "
-                f"were predicted (Guards.joint_jump is {deg(guards.joint_jump)}): check its sensor"
-            )
-            return Objection(StopReason.JOINT_JUMP, message)
-        way, turn = (math.sqrt(part @ part) for part in (off[-6:-3], off[-3:]))
-        if (way > guards.translation_jump or turn > guards.rotation_jump) and hold(seen):
-            message = (
-                f"the pose is {1e3 * way:.1f} mm and {deg(turn)} away from what was predicted, while "
-                f"the fingertips hold the object (Guards allow jumps of {1e3 * guards.translation_jump:g} mm "
-                f"and {deg(guards.rotation_jump)}): check camera and markers"
-            )
-            return Objection(StopReason.POSE_JUMP, message)
-        return None
+        angles = {"turned": ds[i], "predicted": predicted[i], "most": guards.joint_jump}
+        said = check("joint jump", abs(off[i]), guards.joint_jump, angles, name=self.hand.joint_names[i])
+        if not unseen and hold(seen):
+            way, turn = (math.sqrt(part @ part) for part in (off[-6:-3], off[-3:]))
+            share = max(way / guards.translation_jump, turn / guards.rotation_jump)
+            angles, most = {"turn": turn, "most": guards.rotation_jump}, 1e3 * guards.translation_jump
+            said += check("pose jump", share, 1.0, angles, way=1e3 * way, most_way=most)
+        return said
 
     def _gate(
         self, before: Observation, ds: Array, expected: Expectation, seen: Observation, blind: int
-    ) -> Objection | None:
-        """The innovation against its covariance."""
-        sigma, predicted = self._deviation(before, expected, seen, blind), expected.increment.numpy()
-        z, n_q = abs(ds - predicted) / sigma, self.hand.n_q
-        i = int(z.argmax())
-        if z[i] <= self.guards.gate:
-            return None
-        if i < n_q:
-            what, unit, name = f"joint '{self.hand.joint_names[i]}' turned", _DEG, "deg"
-        elif i < n_q + 3:
-            what, unit, name = f"the object went along {'xyz'[i - n_q]}", 1e-3, "mm"
-        else:
-            what, unit, name = f"the object turned about {'xyz'[i - n_q - 3]}", _DEG, "deg"
-        message = (
-            f"{what} {float(ds[i]) / unit:.2f} {name} where {float(predicted[i]) / unit:.2f} ± "
-            f"{float(sigma[i]) / unit:.2f} {name} were predicted (Guards.gate is {self.guards.gate:g})"
-        )
-        return Objection(StopReason.BLIND, message, gated=True)
-
-    def _deviation(self, before: Observation, expected: Expectation, seen: Observation, blind: int) -> Array:
-        """sigma of each entry of an increment, see :class:`~torch_ekm.control.Guards`."""
+    ) -> list[Objection]:
+        """The innovation against its covariance, see :class:`~torch_ekm.control.Guards`."""
         guards, n_q, predicted = self.guards, self.hand.n_q, expected.increment.numpy()
-        variance = self._noise(before, seen)
         # blind motions before this one left the pose as unsure as the model is
         share = guards.relative * (1 + blind)
         way, turn = (math.sqrt(part @ part) for part in (predicted[-6:-3], predicted[-3:]))
         along, about = way + _LEVER * turn, turn + way / _LEVER
         size = np.array([abs(predicted[:n_q]).max()] * n_q + [along] * 3 + [about] * 3)
-        return np.sqrt(variance + (share * size) ** 2 + expected.deviation.numpy() ** 2)
+        sigma = np.sqrt(self._noise(before, seen) + (share * size) ** 2 + expected.deviation.numpy() ** 2)
+        z = abs(ds - predicted) / sigma
+        i = int(z.argmax())
+        names = [f"joint '{name}' turned" for name in self.hand.joint_names]
+        names += [f"the object {went} {axis}" for went in ("went along", "turned about") for axis in "xyz"]
+        unit, scale = ("mm", 1e-3) if n_q <= i < n_q + 3 else ("deg", DEGREE)
+        words = {"came": ds[i] / scale, "predicted": predicted[i] / scale, "sigma": sigma[i] / scale}
+        return check("gate", z[i], guards.gate, what=names[i], unit=unit, **words)
 
     def _noise(self, before: Observation, seen: Observation) -> Array:
-        """Variances of a measured increment ``(n_s,)``."""
-        joints = np.full(self.hand.n_q, 2 * self.guards.joint_noise**2)
-        return np.concatenate([joints, self._stated(before) + self._stated(seen)])
+        """Variances of a measured increment ``(n_s,)``; of poses as stated, and no less than the guards'."""
+        least = np.array([self.guards.translation_noise**2] * 3 + [self.guards.rotation_noise**2] * 3)
+        pose = 0 * least
+        for cov in (_stated(before), _stated(seen)):
+            pose += least if cov is None else np.maximum(np.nan_to_num(cov.diagonal().numpy()), least)
+        return np.concatenate([np.full(self.hand.n_q, 2 * self.guards.joint_noise**2), pose])
 
     def share(self, before: Observation, seen: Observation, predicted: Tensor) -> tuple[float, float]:
         """How much of a predicted increment was made, and the size of that in standard deviations."""
@@ -249,21 +184,12 @@ class ReadingTests:
 
     def pose_noise(self, seen: Observation, focus: FocusedPose) -> float:
         """Standard deviation of a pose in the focus, as a turn [rad]: as stated, or the guards'."""
-        unit = torch.tensor([self.guards.translation_noise] * 3 + [self.guards.rotation_noise] * 3).double()
-        cov = seen.info.get("estimate", {}).get("pose_covariance")
+        cov = _stated(seen)
         if cov is None or not bool(torch.isfinite(cov).all()):
-            cov = torch.diag(unit.square())
+            std = [self.guards.translation_noise] * 3 + [self.guards.rotation_noise] * 3
+            cov = torch.diag(torch.tensor(std).double().square())
         M = focus.matrix
         return float((focus.tolerance_scale * (M @ cov @ M.mT).diagonal().clamp(min=0.0).sqrt()).max())
-
-    def _stated(self, reading: Observation) -> Array:
-        """Variances of a pose ``(6,)``: as stated, and no less than what the guards allow."""
-        o, R = self.guards.translation_noise**2, self.guards.rotation_noise**2
-        least = np.array([o, o, o, R, R, R])
-        stated = reading.info.get("estimate", {}).get("pose_covariance")
-        if stated is None:
-            return least
-        return np.maximum(np.nan_to_num(stated.diagonal().numpy()), least)
 
     def follow(self, before: Observation | None, seen: Observation) -> None:
         """Remember a reading, and how far the encoders went since joints and pose changed."""
@@ -271,20 +197,20 @@ class ReadingTests:
         self._path = {sensor: way + moved if same[sensor] else 0.0 for sensor, way in self._path.items()}
         if self._still is None or not torch.equal(seen.a, self._still.a):
             self._still = seen
-        self._raw = seen
+        self._last = seen
 
     def _same(self, seen: Observation) -> dict[str, bool]:
         """Sensors that read what they read before, bit by bit."""
-        last = self._raw
+        last = self._last
         if last is None:
             return {"joints": False, "pose": False}
         stands = torch.equal(seen.position, last.position) and torch.equal(seen.rotation, last.rotation)
         return {"joints": torch.equal(seen.q, last.q), "pose": stands}
 
 
-def deg(angle: Any) -> str:
-    """An angle [rad] as a text in degrees."""
-    return f"{float(angle) / _DEG:.3g} deg"
+def hold(seen: Observation) -> bool:
+    """Two fingertips at least measure a force: an object is between them."""
+    return seen.fingertip_force is not None and int((seen.fingertip_force > NOISE.pressing).sum()) > 1
 
 
 def agree(one: Observation, other: Observation, guards: Guards) -> bool:
@@ -292,3 +218,8 @@ def agree(one: Observation, other: Observation, guards: Guards) -> bool:
     ds = other.state.minus(one.state)
     noise = [guards.joint_noise] * len(one.q) + [guards.translation_noise] * 3 + [guards.rotation_noise] * 3
     return bool((ds.abs() <= math.sqrt(2) * guards.gate * ds.new_tensor(noise)).all())
+
+
+def _stated(seen: Observation) -> Tensor | None:
+    """Covariance of its pose, as the plant states it."""
+    return seen.info.get("estimate", {}).get("pose_covariance")

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
-from ...kinematics import ServoModel
-from ...kinematics.servo_model import IdealServos
+from ..._noise import DEGREE, NOISE
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
 from ..lessons import felt
-from .consistency import Consistency
-from .fingertips import Fingertips, FingertipWatch
-from .readings import ReadingTests, agree, deg
-from .safety import Guards, Objection
+from .guards import TABLE, Effect, Guards, Objection, check, deg, ended, gravest
+from .motions import MotionTests
+from .readings import ReadingTests, agree
 
 if TYPE_CHECKING:
+    from ...kinematics import ServoModel
+    from ...kinematics.servo_model import IdealServos
     from ...model import KinematicModel
 
-_DEG = math.pi / 180
-_STILL = 0.05 * _DEG  # an encoder that moves less stands
+_STILL = 0.05 * DEGREE  # an encoder that moves less stands
 _UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
-_WEAK = 0.75  # of what it should bear, that a finger lacks with which nothing is turned
-_ASKED = 0.5 * _DEG  # a smaller command to a motor that was stuck before does not show whether it still is
 
 
 class Verdict(NamedTuple):
@@ -54,20 +51,15 @@ class Watch:
         guards: limits.
         model: f, with the hand.
         tolerance: of the target [rad]; errors that grow by more are no noise.
-        servo: what is known of the servos; None: they are ideal.
+        servo: what is known of the servos.
     """
 
     def __init__(
-        self,
-        guards: Guards,
-        model: KinematicModel,
-        tolerance: float = math.inf,
-        servo: ServoModel | IdealServos | None = None,
+        self, guards: Guards, model: KinematicModel, tolerance: float, servo: ServoModel | IdealServos
     ) -> None:
         self.guards, self.hand = guards, model.hand
-        self.readings, self.fingertips = ReadingTests(guards, model.hand), FingertipWatch(guards, model)
-        servo = IdealServos(model.hand.actuator_names) if servo is None else servo
-        self.consistency = Consistency(self.readings, model, servo)
+        self.readings = ReadingTests(guards, model.hand)
+        self.motions = MotionTests(self.readings, model, servo)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0
@@ -76,6 +68,8 @@ class Watch:
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
         self.lie = ""
         """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
+        self._objected: Counter[str] = Counter()
+        """Motions in succession in which a test of the table objects."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
         self._tolerance, self._away = tolerance, 0
         self._undated = ""
@@ -90,14 +84,15 @@ class Watch:
                 break
             seen = look()
         self.readings.follow(None, seen)
-        self.consistency.begin(seen)
+        self.motions.begin(seen)
         self._undated = "" if seen.dated else _UNDATED
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return Verdict(seen, doubt is None, doubt)
 
-    def command(self, decision: Decision, seen: Observation) -> Objection | None:
-        """Why a motion is refused before it is made; None: it is not. Its size is the gate's concern."""
-        return self.fingertips.before(decision, seen)
+    def command(self, decision: Decision, seen: Observation, first: bool) -> Objection | None:
+        """Why a motion, or the first that turns, is refused before it is made; None: it is not. Its size is
+        the gate's concern."""
+        return gravest(self.motions.before(decision, seen, first))
 
     def motion(
         self,
@@ -114,34 +109,25 @@ class Watch:
             expect: f + g of what the encoders did.
             look: gives another reading where the first is in doubt.
         """
-        self.slid = ""
         seen, last, doubt, expected = self._look(before, decision, sent, after, expect, look)
+        self.slid = ""
         if seen.status is PlantStatus.LOST:
             return Verdict(seen, False)
-        if doubt is not None and not (doubt.blind or doubt.gated):
-            if doubt.reason in (StopReason.POSE_JUMP, StopReason.JOINT_JUMP):
-                self.slid = self._slid(doubt.reason, before, expected, last, seen)
-            if not self.slid:  # empty but for a pose or a finger that jumps
+        sure = last is not None and agree(last, seen, self.guards)
+        if doubt is not None and doubt.effect is Effect.STOP:
+            self.slid = self._slid(doubt.reason, before, expected, seen) if sure else ""
+            if not self.slid:
                 return Verdict(seen, False, doubt, "", expected)
-            doubt = doubt._replace(gated=True, message=self.slid)
-        if doubt is not None and doubt.gated and (last is None or not agree(last, seen, self.guards)):
-            doubt = doubt._replace(blind=True)
-        tips = self.fingertips.judge(before, decision, seen)
+            doubt = Objection(doubt.reason, self.slid, Effect.UNLEARNED)
+        force, said = self.motions.fingertips(before, decision, seen)
         self.readings.follow(before, seen)
-        if tips.force is not seen.fingertip_force:
-            seen = dataclasses.replace(seen, fingertip_force=tips.force)
-        verdict = self._verdict(before, seen, doubt, expected, tips)
-        if (doubt is not None and doubt.blind) or self.slid:
-            return verdict
-        odd, halt = self.consistency.motion(before, sent, seen, expected)
-        if odd is None:
-            self.lie = self.lie or ("" if tips.true else tips.note)
-            return verdict if tips.true else verdict._replace(teaches=False)
-        if odd.encoders:
-            self.lie = odd.message
-        note = "; ".join(filter(None, (verdict.note, odd.message)))
-        halt = verdict.halt or halt
-        return verdict._replace(teaches=False, halt=halt, note=note, encoders=not odd.encoders)
+        if force is not seen.fingertip_force:
+            seen = dataclasses.replace(seen, fingertip_force=force)
+        if doubt is not None and (doubt.effect is Effect.BLIND or not sure):
+            return self._blind(before, seen, doubt, expected, said)
+        if not self.slid:
+            said += self._running(self.motions.motion(before, sent, seen, expected))
+        return self._seen(seen, doubt, expected, said)
 
     def _look(
         self,
@@ -160,52 +146,74 @@ class Watch:
             if decision.pieces and (last is None or not torch.equal(seen.a, last.a)):
                 expected = expect(seen.a - before.a)
             doubt = self.readings.after_motion(before, sent, seen, expected, self.blind)
-            if left == 0 or (doubt is None and not self.fingertips.high(seen)):
+            if left == 0 or (doubt is None and not self.motions.high(seen)):
                 return seen, last, doubt, expected
             last, seen = seen, _with_events(look(), seen)
         return seen, last, None, expected
 
-    def _verdict(
+    def _running(self, said: list[Objection]) -> list[Objection]:
+        """With the end of the manipulation, where a test objects in as many motions running as it may."""
+        for name, test in TABLE.items():
+            found = next((one for one in said if one.test == name), None)
+            n = self._objected[name] = 0 if found is None else self._objected[name] + 1
+            if found is not None and 0 < test.running <= n:
+                said.append(Objection(found.reason, f"{found.message} (motions running: {n})"))
+        return said
+
+    def _blind(
         self,
         before: Observation,
+        seen: Observation,
+        doubt: Objection,
+        expected: Expectation | None,
+        said: list[Objection],
+    ) -> Verdict:
+        """The pose that the model predicts for what the encoders did, for some motions."""
+        pose, most = before.state, self.guards.blind_motions
+        if expected is not None:
+            pose = pose.plus(expected.increment)
+        status = PlantStatus.NOT_SEEN
+        seen = dataclasses.replace(seen, position=pose.position, rotation=pose.rotation, status=status)
+        self.blind += 1
+        halt = ended(said)
+        if halt is None and self.blind > most:
+            more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
+            halt = Objection(doubt.reason, more)
+        return Verdict(seen, False, halt, doubt.message, expected)
+
+    def _seen(
+        self,
         seen: Observation,
         doubt: Objection | None,
         expected: Expectation | None,
-        tips: Fingertips,
+        said: list[Objection],
     ) -> Verdict:
-        """Of a reading with which the loop goes on, unless fingertips or too many blind motions end it."""
-        measured, halt = self.blind == 0, tips.halt
-        if doubt is not None and doubt.blind:
-            self.blind += 1
-            seen, most = self._predicted(before, expected, seen), self.guards.blind_motions
-            if self.blind > most:
-                more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
-                halt = halt or Objection(doubt.reason, more)
-            return Verdict(seen, False, halt, doubt.message, expected)
-        self.blind = 0
-        if doubt is None:
-            self.gated = 0
-            note, self._undated = "; ".join(filter(None, (self._undated, tips.note))), ""
-            return Verdict(seen, measured and halt is None, halt, note, expected)
-        self.gated += 1  # what is seen again and again is the truth, and the model is wrong
-        again = self.gated > self.guards.blind_motions and not self.slid
-        return Verdict(seen, measured and again and halt is None, halt, doubt.message, expected)
+        """Of a reading with its pose."""
+        measured, halt = self.blind == 0, ended(said)
+        self.blind, self.gated = 0, 0 if doubt is None else self.gated + 1
+        # what is seen again and again is the truth, and the model is wrong
+        true = doubt is None or (self.gated > self.guards.blind_motions and not self.slid)
+        teaches = true and measured and all(one.effect is Effect.TOLD for one in said)
+        lies = (one.message for one in said if one.effect is Effect.LIES)
+        self.lie = "; ".join(lies) or self.lie
+        notes = [self._undated, "" if doubt is None else doubt.message]
+        notes += [one.message for one in said if one.effect is not Effect.STOP]
+        self._undated = ""
+        encoders = all(one.reason is not StopReason.ENCODER_DRIFT for one in said)
+        return Verdict(seen, teaches, halt, "; ".join(filter(None, notes)), expected, encoders)
 
     def _slid(
-        self,
-        reason: StopReason,
-        before: Observation,
-        expected: Expectation | None,
-        last: Observation | None,
-        seen: Observation,
+        self, reason: StopReason, before: Observation, expected: Expectation | None, seen: Observation
     ) -> str:
         """What two looks show that agree is true of a pose where the grip has changed, too, and of a joint
-        where the pads that press lie on the object."""
-        if expected is None or last is None or not agree(last, seen, self.guards):
-            return ""
-        surprise = felt(self.hand, expected, before, seen)
-        changed = surprise is not None and surprise.wrong(before)
-        if not (self.consistency.on_surface(seen) if reason is StopReason.JOINT_JUMP else changed):
+        where the pads that press lie on the object; empty: it is not."""
+        true = False
+        if expected is not None and reason is StopReason.JOINT_JUMP:
+            true = self.motions.on_surface(seen)
+        elif expected is not None and reason is StopReason.POSE_JUMP:
+            surprise = felt(self.hand, expected, before, seen)
+            true = surprise is not None and surprise.wrong(before)
+        if expected is None or not true:
             return ""
         ds = (seen.state.minus(before.state) - expected.increment)[-6:]
         way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
@@ -219,31 +227,7 @@ class Watch:
             return None
         away = errors[-1] - errors[-2] > self._tolerance and float(moved @ da) > 0.5 * float(da @ da)
         self._away = self._away + 1 if away else 0
-        if self._away < self.guards.wrong_way:
-            return None
-        message = (
-            f"the object has gone away from its target in {self._away} motions running, while the motors did "
-            "as commanded: a motor's or a joint's sign is wrong, or the pose is in another frame; see "
-            "'torch-ekm check --plant'"
-        )
-        return Objection(StopReason.WRONG_WAY, message)
-
-    def suspects(self, seen: Observation) -> str:
-        """Which sensors contradict each other where the model refuses a state."""
-        return self.consistency.suspects(seen)
-
-    def weak(self, decision: Decision, seen: Observation) -> str:
-        """Fingers that bear less than the object needs, as measured; empty: none."""
-        grip, lin = decision.grip, decision.linearization
-        if grip is None or lin is None or seen.fingertip_force is None:  # an estimate is no reason
-            return ""
-        rows, _ = self.hand.pad_rows(lin.contacts.finger)
-        bears = zip(rows, grip.force.tolist(), grip.least.tolist(), strict=True)
-        return ", ".join(
-            f"finger '{lin.contacts.finger[i]}' bears {force:.1f} N of {least:.1f} N"
-            for i, force, least in bears
-            if force < _WEAK * least
-        )
+        return gravest(check("away", self._away, self.guards.wrong_way - 1))
 
     def rest(self, before: Observation, seen: Observation) -> Observation:
         """A further reading of a hand at rest, or ``before`` where it cannot be one."""
@@ -261,24 +245,10 @@ class Watch:
             stuck: which the servo model calls so.
         """
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
-        again = still & (size > self.guards.stuck_command)
-        self._still = torch.where(again, self._still + 1, 0 * self._still)
-        found = (self._still > 1) | (stuck & still & (size > _ASKED))
-        if not bool(found.any()):
-            return None
-        names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in found.nonzero().flatten().tolist())
-        message = f"actuator {names} does not move however it is commanded: check motor and tendon"
-        return Objection(StopReason.ACTUATOR_STUCK, message)
-
-    @staticmethod
-    def _predicted(before: Observation, expected: Expectation | None, seen: Observation) -> Observation:
-        """With the pose that the model predicts for what the encoders did."""
-        pose = before.state
-        if expected is not None:
-            pose = pose.plus(expected.increment)
-        return dataclasses.replace(
-            seen, position=pose.position, rotation=pose.rotation, status=PlantStatus.NOT_SEEN
-        )
+        self._still = (self._still + 1) * (still & (size > self.guards.stuck_command))
+        which = (self._still > 1) | (stuck & still & (size > NOISE.dead_zone))
+        names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in which.nonzero().flatten().tolist())
+        return gravest(check("stuck", len(names), 0, names=names))
 
 
 def _with_events(seen: Observation, earlier: Observation) -> Observation:
