@@ -265,6 +265,7 @@ class ClosedLoop:
         increment, pull = after.state.minus(seen.state), after.a - seen.a
         if halt is None and after.status is not PlantStatus.LOST:  # else nobody learns from this reading
             moved = pull
+            self.knowledge.checkpoint()
             if verdict.encoders:
                 self.plant.learn(after)
             halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)

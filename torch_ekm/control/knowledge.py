@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -20,9 +21,11 @@ from ..exceptions import EKMError, FileFormatError, ParameterError, StateError
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
+from ..typing import Tensor
 from .model_error import ModelError
 
 Part = Literal["servo", "forces", "figures", "error"]
+_KEPT = 8  # motions whose lessons can be taken back
 
 
 class HandKnowledge(Recorded, nn.Module):
@@ -56,6 +59,7 @@ class HandKnowledge(Recorded, nn.Module):
         self.servo, self.forces, self.figures = servo, forces, figures
         self.error = ModelError()
         """Share of a motion by which it ends elsewhere than predicted."""
+        self._before: deque[dict[str, Tensor]] = deque(maxlen=_KEPT)  # states before the last motions
 
     @classmethod
     def of(cls, hand: HandDescription, *, learns: bool = True, adapts: bool = True) -> HandKnowledge:
@@ -86,6 +90,18 @@ class HandKnowledge(Recorded, nn.Module):
             )
         self.figures.check(hand)
 
+    def checkpoint(self) -> None:
+        """Before a motion is learned: what is known now can be had back by :meth:`take_back`."""
+        self._before.append({name: value.clone() for name, value in self.state_dict().items()})
+
+    def take_back(self, motions: int = 1) -> int:
+        """All parts are as they were before the last ``motions`` checkpoints, eight of which are kept; how
+        many that were."""
+        taken = [self._before.pop() for _ in range(min(motions, len(self._before)))]
+        if taken:
+            super().load_state_dict(taken[-1], strict=False)  # a part may have been exchanged since
+        return len(taken)
+
     def load_state_dict(
         self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
     ) -> Any:
@@ -97,6 +113,7 @@ class HandKnowledge(Recorded, nn.Module):
         state_dict = _of_now(state_dict)
         if strict:
             check_state(self, state_dict)
+        self._before.clear()
         return super().load_state_dict(state_dict, strict=strict, assign=assign)
 
     def reset(self, part: Part) -> None:
