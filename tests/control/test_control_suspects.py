@@ -12,6 +12,7 @@ from obedient_plant import Fault, Obedient
 from torch_ekm.control import (
     ClosedLoop,
     Guards,
+    HandKnowledge,
     LookAndMoveController,
     Manipulation,
     PoseTarget,
@@ -79,20 +80,33 @@ def test_moment_arms_that_are_not_as_described_are_no_fault_of_a_sensor(held) ->
         assert ("'index_distal'" in watch.motions.suspects(dataclasses.replace(seen, q=q, a=a))) is blamed
 
 
-@pytest.mark.parametrize("scale", [1.0, 0.5])
-def test_fingertips_that_read_half_are_told(held, scale) -> None:
-    """Nothing ends: it may be the springs. The grip is too hard by as much."""
+def test_fingertips_that_read_too_little_are_told_until_they_are_known_to(held) -> None:
+    """On a hand of which nothing is known it may be the springs: it is told, and learned. After healthy turns
+    it is a fault, of which nothing is learned, until it has lasted for some grasps."""
+    seen, axis, model = held
+    knowledge = HandKnowledge.of(model.hand)
 
-    def scaled(plant: Obedient, seen: Observation) -> Observation:
-        return dataclasses.replace(seen, fingertip_force=scale * seen.fingertip_force)
+    def turned(scale: float) -> Manipulation:
+        def scaled(plant: Obedient, seen: Observation) -> Observation:
+            return dataclasses.replace(seen, fingertip_force=scale * seen.fingertip_force)
 
-    done = run(held, scaled, since=0)
-    assert done.reason is Reason.REACHED
-    told = [k for k, step in enumerate(done.steps) if "joints and springs give" in step.note]
-    assert told[:2] == ([] if scale == 1 else [0, 1])
-    assert ("joints and springs give" in done.stop.message) is (scale != 1)
-    if told:
-        assert "check their scale" in done.steps[0].note
+        controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+        loop = ClosedLoop(Obedient(model, seen, scaled, since=0), controller, knowledge=knowledge)
+        return loop.run(PoseTarget.turned(seen.state, axis, degrees=8))
+
+    known, told = [], []
+    for scale in (0.4, 0.4, *[1.0] * 8, 0.4):
+        before = knowledge.forces.theta.clone()
+        done = turned(scale)
+        assert done.reason is Reason.REACHED
+        known.append(knowledge.forces.usual)
+        learned = not torch.equal(knowledge.forces.theta, before)
+        told.append((("check their scale" in done.stop.message), learned))
+    assert told[:2] == [(True, True), (False, True)]
+    assert known[1] == pytest.approx(0.4, abs=0.1)
+    assert told[2] == (True, False)
+    assert told[8:10] == [(False, True)] * 2
+    assert told[10] == (True, False)
 
 
 def test_readings_without_a_date_are_told_once(held) -> None:

@@ -179,12 +179,13 @@ class ClosedLoop:
             known = self.learned.state()
             try:
                 watch = Watch(self.safety.guards, controller.kinematic, self.safety.rule.tolerance,
-                              self.knowledge.servo)  # fmt: skip
+                              self.knowledge.servo, self.knowledge.forces.usual)  # fmt: skip
                 stop = yield from self._movements(target, watch)
                 if watch.lie or stop.reason is StopReason.WRONG_WAY:
                     self.learned.restore(known)
-                    stop = stop.told(watch.lie)
-                return stop
+                if self.learn and controller.enhanced is not None and watch.motions.times is not None:
+                    self.knowledge.forces.grasped(watch.motions.times)  # also of pads that seem to lie
+                return stop.told(watch.lie or watch.doubt)
             except (Exception, KeyboardInterrupt) as error:
                 last, failure = self._gate.last, self._gate.failure
                 self.hold()

@@ -167,6 +167,7 @@ def _of_now(state: Mapping[str, Any]) -> dict[str, Any]:
         return dict(state)
     kept = {name: value for name, value in state.items() if name not in ("pace", "forces.drift")}
     of_now = {f"error.{name}": value for name, value in ModelError().state_dict().items()}
+    of_now["forces.reads"] = torch.zeros(2, dtype=torch.float64)
     if "forces.drift" in state:
         theta, evidence = kept["forces.theta"], kept["forces.evidence"]
         at = [0, *range(2, 1 + theta.shape[-1])]

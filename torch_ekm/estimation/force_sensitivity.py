@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ _LARGEST_STD = 20.0  # [N] of a change of force that c and B do not explain
 _LEAST_STD = 0.5 * NOISE.force  # [N] of a pad that does as c and B say
 _MOST_EVIDENCE = 1e12  # [N^2]: no pad bears what would make more of it
 _USUAL = 1 / 0.3**2 - 1  # information on theta that hands have in common, on top of the prior's
+_GRASPS, _MOST_READ = 8, math.log(10.0)  # that count in the mean of the pads' scale, and its bound
 _FORGETTING = 0.97  # of what earlier motions say in the direction of a new one
 _RECENT = 0.1  # weight of the last motion in the variance of r
 
@@ -51,6 +53,20 @@ class ForceSensitivity(Recorded, nn.Module):
         """D, of the motions that each pad measured."""
         self.variance = nn.Buffer(torch.full((n_pads,), NOISE.force**2, dtype=torch.float64))
         """s^2 of each pad [N^2]."""
+        self.reads = nn.Buffer(torch.zeros(2, dtype=torch.float64))
+        """Mean of ln of how many times the pads read what joints and springs give, and of how many grasps."""
+
+    @property
+    def usual(self) -> float | None:
+        """How many times all pads together read what joints and springs give; None before the first grasp."""
+        return math.exp(float(self.reads[0])) if self.reads[1] else None
+
+    def grasped(self, times: float) -> None:
+        """All pads together read ``times`` what joints and springs give, in one more grasp of the hand: its
+        springs may be others than described, and so may the scale of the pads."""
+        before = min(float(self.reads[1]), _GRASPS - 1)
+        mean = float(self.reads[0]) + (math.log(times) - float(self.reads[0])) / (before + 1)
+        self.reads.copy_(torch.tensor([min(max(mean, -_MOST_READ), _MOST_READ), before + 1]))
 
     @property
     def scale(self) -> Float[Tensor, " n_pads"]:
@@ -163,6 +179,7 @@ class ForceSensitivity(Recorded, nn.Module):
             theta=(-NOISE.furthest, NOISE.furthest),
             variance=(0.9 * _LEAST_STD**2, _LARGEST_STD**2),  # files of a smaller noise hold
             evidence=(-_MOST_EVIDENCE, _MOST_EVIDENCE),
+            reads=(-_MOST_READ, _GRASPS),
         )
         if wrong:
             return wrong

@@ -193,8 +193,13 @@ TABLE: dict[str, Test] = {
     "late": Test(_R.STALE_SENSOR, "the fingertips were read at {taken:.3f} s", _STANDS_IN, _E.TOLD),
     "scale": Test(
         _R.FINGERTIP_FAULT,
+        "the fingertips read {measured:.1f} N, joints and springs give {other:.1f} N, as a rule {times:.2g} "
+        "times that on this hand ({scale:g} times are allowed)", "check their scale; nothing is learned",
+        _E.LIES),
+    "first scale": Test(
+        _R.FINGERTIP_FAULT,
         "the fingertips read {measured:.1f} N, joints and springs give {other:.1f} N ({scale:g} times are "
-        "allowed)", "check their scale, and the description's springs; nothing is learned", _E.LIES),
+        "allowed)", "check their scale, and the description's springs", _E.TOLD),
     "at fault": Test(_R.FINGERTIP_FAULT, "{said}", _STANDS_IN, _E.TOLD),
     "several at fault": Test(
         _R.FINGERTIP_FAULT, "{said} (Guards.faulty_pads is {limit})",

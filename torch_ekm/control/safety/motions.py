@@ -47,14 +47,22 @@ class MotionTests:
         readings: tests and limits of single readings.
         model: f, with the hand.
         servo: what is known of the servos.
+        usual: how many times what joints and springs give the fingertips read; None: not known yet.
     """
 
     def __init__(
-        self, readings: ReadingTests, model: KinematicModel, servo: ServoModel | IdealServos
+        self,
+        readings: ReadingTests,
+        model: KinematicModel,
+        servo: ServoModel | IdealServos,
+        usual: float | None = None,
     ) -> None:
         self.guards, self.readings, self.hand, self.model = readings.guards, readings, model.hand, model
         self.servo, self.pads = servo, [pad.name for pad in model.hand.pads]
         self._least = model.options.forces.normal_std
+        self._usual = usual
+        self.times: float | None = None
+        """The same in this grasp, before its grip has changed; None: joints and springs say nothing."""
         self._begun: Observation | None = None
         self._sums = np.zeros((6, model.hand.n_a))  # n, w, w^2, e, w e, e^2 of each actuator
         self._force: Tensor | None = None  # before the first motion
@@ -135,11 +143,18 @@ class MotionTests:
         return check("ceiling", force, self.guards.force_ceiling, name=self.pads[pad], how=how)
 
     def _scale(self, seen: Observation, force: Tensor) -> list[Objection]:
-        """All fingertips together read much more or less than joints and springs give."""
+        """All fingertips together read much more or less than joints and springs give: than they do on this
+        hand, or, where none of its grasps is known, than described."""
         alone = {i: other for i, other in self._by_joints(seen).items() if force[i] > self._least}
         measured, other = float(force[list(alone)].sum()), sum(alone.values())
-        plain = len(alone) < 2 or measured / _SCALE < other < measured * _SCALE or other < measured / _NOTHING
-        return check("scale", not plain, 0, measured=measured, other=other, scale=_SCALE)
+        if len(alone) < 2 or other < measured / _NOTHING:
+            return []
+        self.times = measured / other if self.times is None else self.times
+        usual = 1.0 if self._usual is None else self._usual
+        plain = measured / _SCALE < usual * other < measured * _SCALE
+        test = "first scale" if self._usual is None else "scale"
+        words = {"measured": measured, "other": other, "scale": _SCALE, "times": usual}
+        return check(test, not plain, 0, **words)
 
     def _frozen(self, force: Tensor, moved: float) -> list[int]:
         """Pads that read the same again and again while the encoders move."""

@@ -52,14 +52,20 @@ class Watch:
         model: f, with the hand.
         tolerance: of the target [rad]; errors that grow by more are no noise.
         servo: what is known of the servos.
+        usual: how many times what joints and springs give the fingertips read; None: not known yet.
     """
 
     def __init__(
-        self, guards: Guards, model: KinematicModel, tolerance: float, servo: ServoModel | IdealServos
+        self,
+        guards: Guards,
+        model: KinematicModel,
+        tolerance: float,
+        servo: ServoModel | IdealServos,
+        usual: float | None = None,
     ) -> None:
         self.guards, self.hand = guards, model.hand
         self.readings = ReadingTests(guards, model.hand)
-        self.motions = MotionTests(self.readings, model, servo)
+        self.motions = MotionTests(self.readings, model, servo, usual)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0
@@ -68,6 +74,8 @@ class Watch:
         """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
         self.lie = ""
         """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
+        self.doubt = ""
+        """That fingertips and springs contradict each other on a hand of which nothing is known; or empty."""
         self._objected: Counter[str] = Counter()
         """Motions in succession in which a test of the table objects."""
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
@@ -196,6 +204,7 @@ class Watch:
         teaches = true and measured and all(one.effect is Effect.TOLD for one in said)
         lies = (one.message for one in said if one.effect is Effect.LIES)
         self.lie = "; ".join(lies) or self.lie
+        self.doubt = next((one.message for one in said if one.test == "first scale"), self.doubt)
         notes = [self._undated, "" if doubt is None else doubt.message]
         notes += [one.message for one in said if one.effect is not Effect.STOP]
         self._undated = ""
