@@ -13,7 +13,7 @@ import torch
 from .._noise import NOISE
 from ..kinematics import GraspState
 from ..plant import Observation
-from .bands import Band, Bands
+from .bands import Band, Bands, lets_go
 from .decision import Decision, Piece, StopReason
 from .focus import FocusedPose, PoseTarget
 from .rehearsal import LONGEST, End, PathEnd, Rehearsal
@@ -191,7 +191,10 @@ class WholeTurn:
         safe, against, nearest = 0, "", (asked, 0)
         for piece, state in rehearsal.pieces():
             waypoints.append(Waypoint(piece, state, bands.add(piece, state)))
-            against = against or self._against(waypoints[-1].band, most, first=len(waypoints) == 1)
+            first = len(waypoints) == 1
+            against = against or self._against(waypoints[-1].band, most, first)
+            if first:
+                against = against or lets_go(rehearsal.hand.hand, piece, self.deviations)
             safe += not against
             left = focus.error(target, state)
             nearest = min(nearest, (left, len(waypoints)))
@@ -269,6 +272,8 @@ class WholeTurn:
             why = against or "a finger is at its friction limit"
         elif least <= self.force:
             why = against or f"a finger keeps {least:.1f} N"
+        elif go := lets_go(controller.kinematic.hand, decision.pieces[0], self.deviations):
+            why = go
         elif after > self.off_rotation:
             why = against or f"the object is {after / _DEG:.1f} deg off the axis"
         else:

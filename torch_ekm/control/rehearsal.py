@@ -13,6 +13,7 @@ from ..exceptions import GraspError, NoContactError, UnstableGraspError
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
+from .bands import lets_go
 from .decision import Decision, Piece, StopReason
 from .focus import PoseTarget
 from .limiting import LimitingFunction
@@ -28,6 +29,7 @@ _THERE = 0.1 * _DEG  # [rad] of the error, as a turn: the path ends
 _MOST = 60  # pieces
 LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is planned when it is there
 _HALVES, _CUT = 3, 0.99  # times that a piece is tried, and share of an actuator's step that cuts it short
+_DEVIATIONS = 2.0  # of servos' errors, that let no finger go
 _GRIPPED = 0.95  # of the wanted grip
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
 _SLIDES = 0.05  # of its friction, that a pad at its limit has to spare
@@ -130,7 +132,8 @@ class Rehearsal:
         most = min((x.step for x in controller.limits if isinstance(x, ActuatorLimit)), default=math.inf)
         for _ in range(_HALVES):
             decision = controller.choose(lin, controller.situation(lin, here.a, force, error, desired))
-            if float(decision.delta_a.abs().max()) < _CUT * most:
+            goes = [lets_go(self.hand.hand, piece, _DEVIATIONS) for piece in decision.pieces]
+            if float(decision.delta_a.abs().max()) < _CUT * most and not any(goes):
                 break
             desired = desired / 2  # else the focused pose is served at the expense of grip
         return decision

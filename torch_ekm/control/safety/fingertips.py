@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
 import torch
 
 from ...exceptions import GraspError
@@ -49,6 +50,8 @@ class FingertipWatch:
         self.guards, self.model = guards, model
         self.pads = [pad.name for pad in model.hand.pads]
         self.least = model.options.forces.normal_std
+        held = np.vstack([model.hand.actuation_jacobian, model.hand.coupling.reshape(-1, model.hand.n_q)])
+        self._springs = bool(np.linalg.matrix_rank(held) < model.hand.n_q)
         self._last: Tensor | None = None  # before the first motion
         self._repeats = torch.zeros(len(self.pads), dtype=torch.long)
         self._way = torch.zeros(len(self.pads), dtype=torch.float64)
@@ -139,7 +142,10 @@ class FingertipWatch:
         return found.nonzero().flatten().tolist()
 
     def _by_joints(self, seen: Observation) -> dict[int, float]:
-        """Normal force of each pad in contact by joints and springs alone [N]; empty: unknown."""
+        """Normal force of each pad in contact by joints and springs alone [N]; empty: unknown, as where
+        motors and couplings hold every joint."""
+        if not self._springs:
+            return {}
         try:
             return self._normal(self.model.linearize(seen.state))
         except GraspError:
