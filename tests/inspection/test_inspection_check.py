@@ -153,7 +153,7 @@ def test_a_grasp_width_that_is_not_the_objects_is_named():
 def test_where_the_files_have_a_fault_no_other_figure_is_tried(files, monkeypatch):
     tried = []
     monkeypatch.setattr(module, "_cured", lambda *of: tried.append(of) or ())
-    monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "planner")])
+    monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch plan", "error", "not tried")])
     urdf, transmission = files
     assert "collision shapes" not in {row.name for row in check_hand(str(urdf), "can")}
     assert len(tried) == 1
@@ -243,7 +243,7 @@ def test_springs_too_soft_for_the_usual_force_are_told_which_one_they_bear(monke
     monkeypatch.setattr(module, "load_hand", lambda _: hand)
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["limits"].state == "ok"
-    assert "the fingertips reach it; torque is to blame: joint" in rows["pinch"].found
+    assert "the fingertips reach it; torque is to blame: joint" in rows["pinch plan"].found
     force = re.search(r"a pinch_force of ([\d.]+) N", rows["smallest change"].found)
     assert force is not None
     gentle = dataclasses.replace(hand, pinch_force=float(force[1]))
