@@ -17,7 +17,7 @@ from other_hands import main
 from torch_ekm.description import load_hand
 from torch_ekm.simulation import SimulatedHand
 
-KINDS = {"tendon_springs": 0.05, "not_round": 0.05, "four_bar": 0.25, "idle": 0.05, "coupled": 0.1}
+KINDS = {"tendon_springs": 0.05, "not_round": 0.05, "four_bar": 0.25, "idle": 0.05, "coupled": 0.15}
 """And how much of the planned force may be missing: loops give way a little."""
 
 

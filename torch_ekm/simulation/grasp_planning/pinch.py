@@ -33,7 +33,7 @@ _UNDECIDED = 0.9  # of the largest eigenvalue: fingers on a circle bend about no
 _NEAR_AN_AXIS = np.cos(np.radians(15))  # the iCub's fingers bend about y to within 5 deg
 _CLOSING_POSTURES, _SPREADS = 9, 16  # from open to closed, and in each: which pad opposes the others
 _FACES = 0.3  # cosine from which a pad opposes another
-_GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
+_GOOD_COST = 40.0  # half a sum of squares; 0.3 of a good pinch of 12 joints, 35 where servos turn 16 of them
 _LITTLE = 0.1  # of the weight of torques: 1 mm of gap counts as 0.1 N m
 _BAD_COST = 100.0  # pads beside the object, or hand and object in one another
 
