@@ -267,11 +267,11 @@ def _most_opposed(hand: HandDescription, names: list[str], thumb: str | None) ->
         others = [pad for pad in range(len(names)) if pad != one]
         pairs = [opposition(tips[:, [one, pad]], directions[:, [one, pad]])[0].min(axis=1) for pad in others]
         faced = np.stack(pairs, axis=1)
-        best = int(faced.clip(0.0).mean(axis=1).argmax())
-        facing = tuple(names[pad] for pad, cos in zip(others, faced[best], strict=True) if cos > _FACES)
-        found.append((float(faced[best].clip(0.0).mean()), names[one], facing))
-    _, thumb, facing = max(found, key=lambda one: one[0])
-    return thumb, facing or tuple(name for name in names if name != thumb)
+        at = int(faced.clip(0.0).mean(axis=1).argmax())
+        facing = tuple(names[pad] for pad, cos in zip(others, faced[at], strict=True) if cos > _FACES)
+        found.append((float(faced[at].clip(0.0).mean()), names[one], facing))
+    _, best, facing = max(found, key=lambda one: one[0])
+    return best, facing or tuple(name for name in names if name != best)
 
 
 def turning_axis(hand: HandDescription, config: PlantConfig) -> Array:
