@@ -115,8 +115,9 @@ def _four_bar() -> tuple[str, str]:
     return _gripper(more), _head(springs) + motors + loops + _pads()
 
 
-def _servos() -> tuple[str, str]:
-    """Sixteen motors on sixteen joints, nothing else: a thumb against three fingers, in space."""
+def _servos(coupled: bool = False) -> tuple[str, str]:
+    """Sixteen motors on sixteen joints, nothing else: a thumb against three fingers, in space; or the last
+    joint of each finger is coupled to the one before it."""
     parts, motors, joints, pads = ['<link name="palm"/>'], "", {}, ""
     for name, x, y, side in (
         ("thumb", 0.06, 0.0, -1), ("index", 0.0, -0.028, 1), ("middle", 0.0, 0.0, 1), ("ring", 0.0, 0.028, 1)
@@ -135,12 +136,20 @@ def _servos() -> tuple[str, str]:
                 f'<link name="{link}"><inertial><mass value="0.01"/>{inertia}</inertial>{tip}</link>'
             )
             before, at, joints[joint] = link, f"0 0 {long}", 0.0
+            if coupled and k == 3:
+                tie = f"{{ {joint} = 1.0, {name}_2 = -0.8 }}"
+                motors += f'[[couplings]]\nname = "{joint}"\njoints = {tie}\n'
+                continue
             motors += f'[[actuators]]\nname = "m_{joint}"\nrange = [{low}, {high}]\n'
             motors += f"moment_arms = {{ {joint} = 1.0 }}\nstiffness = 10.0\n"
         pads += f'[[pads]]\nname = "{name}"\nlink = "{before}"\nstart = [0, 0, 0.025]\nradius = 0.008\n'
         pads += f"direction = [{side}, 0, 0]\n"
     head = _head(joints).replace("planar_normal = [0, 0, 1]\n", "")
     return "".join(parts), head + motors + pads
+
+
+def _coupled() -> tuple[str, str]:
+    return _servos(coupled=True)
 
 
 def _stiff() -> tuple[str, str]:
@@ -173,10 +182,10 @@ def _jaw() -> tuple[str, str]:
 
 _MADE: dict[str, Callable[[], tuple[str, str]]] = {
     "tendon_springs": _tendon_springs, "four_bar": _four_bar, "not_round": _not_round, "servos": _servos,
-    "stiff": _stiff, "metres": _metres, "jaw": _jaw, "idle": _idle, "round": _round,
+    "stiff": _stiff, "metres": _metres, "jaw": _jaw, "idle": _idle, "coupled": _coupled, "round": _round,
 }  # fmt: skip
-KINDS = tuple(_MADE)[:8]
-"""Eight kinds of hands; "round" is none of them but a reference."""
+KINDS = tuple(_MADE)[:9]
+"""Nine kinds of hands; "round" is none of them but a reference."""
 
 
 def write_hand(kind: str, folder: Path) -> Path:
@@ -189,7 +198,7 @@ def write_hand(kind: str, folder: Path) -> Path:
 
 
 def write_hands(folder: Path) -> Iterator[Path]:
-    """All eight."""
+    """All nine."""
     folder.mkdir(parents=True, exist_ok=True)
     for kind in KINDS:
         yield write_hand(kind, folder)

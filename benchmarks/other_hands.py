@@ -3,7 +3,7 @@
     python benchmarks/other_hands.py FOLDER [--engine mujoco] [--object can] [--degrees 8]
 
 Each ``.urdf``, ``.xml`` and ``.mjcf`` in the folder is a described hand, with its transmission file next to
-it. Where there is none, eight hands of kinds that owners have are written there. The last line counts them.
+it. Where there is none, nine hands of kinds that owners have are written there. The last line counts them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Outcome(NamedTuple):
 
 
 def hands_in(folder: Path) -> list[Path]:
-    """The described hands of a folder, in order; eight that are written first if there are none."""
+    """The described hands of a folder, in order; nine that are written first if there are none."""
     found = sorted(path for path in folder.glob("*") if path.suffix in _ENDINGS)
     return found or sorted(write_hands(folder))
 

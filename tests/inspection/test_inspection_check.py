@@ -141,7 +141,7 @@ def test_a_grasp_width_that_is_not_the_objects_is_named():
 def test_where_the_files_have_a_fault_no_other_figure_is_tried(files, monkeypatch):
     tried = []
     monkeypatch.setattr(module, "_cured", lambda *of: tried.append(of) or ())
-    monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch", "error", "planner")])
+    monkeypatch.setattr(module, "_pinch", lambda *_: [module.Check("pinch plan", "error", "not tried")])
     urdf, transmission = files
     assert "collision shapes" not in {row.name for row in check_hand(str(urdf), "can")}
     assert len(tried) == 1
@@ -212,7 +212,7 @@ def test_springs_too_soft_for_the_usual_force_are_told_what_holds(monkeypatch):
     monkeypatch.setattr(module, "smallest_changes", found)
     rows = {row.name: row for row in check_hand("mine", "can")}
     assert rows["limits"].state == "ok"
-    assert "the fingertips reach it; torque is to blame: joint" in rows["pinch"].found
+    assert "the fingertips reach it; torque is to blame: joint" in rows["pinch plan"].found
     assert rows["smallest change"].found == "the pinch holds with a pinch_force of 1.2 N; or an arm of 2"
 
 

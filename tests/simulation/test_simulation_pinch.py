@@ -8,6 +8,7 @@ import functools
 import numpy as np
 import pytest
 import torch
+from made_hands import write_hand
 from simulation_helpers import DEG
 
 from torch_ekm.contact.detector import ContactDetector
@@ -174,6 +175,14 @@ def test_the_opposing_pad_is_found_by_directions_not_by_order():
     thumb, index, middle, *_ = (dataclasses.replace(pad, name=f"pad {k}") for k, pad in enumerate(hand.pads))
     turned = dataclasses.replace(hand, pads=(index, thumb, middle))
     assert opposing_pads(turned, PlantConfig()) == ("pad 0", ("pad 1", "pad 2"))
+
+
+def test_a_pad_on_the_side_of_the_one_that_opposes_is_idle(tmp_path):
+    hand = load_hand(write_hand("servos", tmp_path))
+    pads = tuple(dataclasses.replace(pad, name=f"pad {pad.name}") for pad in hand.pads)
+    hand = dataclasses.replace(hand, pads=pads)
+    assert opposing_pads(hand, PlantConfig())[0] == "pad thumb"
+    assert opposing_pads(hand, PlantConfig(thumb="pad index")) == ("pad index", ("pad thumb",))
 
 
 def test_an_object_that_no_pinch_holds_is_refused_once(tmp_path, monkeypatch):

@@ -11,25 +11,47 @@ import torch
 from .._noise import NOISE
 from ..estimation.hand_figures import HandFigures
 from ..kinematics import GraspState
-from ..typing import Array, Tensor
+from ..typing import Array, Float, Tensor
 from .decision import Band, Piece
 from .model_error import STEADY
 
 if TYPE_CHECKING:
+    from ..description import HandDescription
+    from ..model import Linearization
     from ..plant import Observation
     from .controller import LookAndMoveController
     from .focus import PoseTarget
     from .knowledge import HandKnowledge
 
 _LEVER = 0.03  # [m]: a share of a rotation counts as much as that share of this translation
+_SERVO = 0.05  # of its way, that a servo errs
 _SHARE = 0.15  # of the way that a normal force has come: what the model does not know of it
+
+
+def servo_std(lin: Linearization, w: Float[Tensor, " n_a"], pads: Tensor | list[int]) -> Tensor:
+    """``sqrt(sum_j (df_n/da_j sd_j)^2)``: what servos that err by ``sd_j`` change of normal forces [N].
+
+    A finger of 20 N m/rad loses or gains several newtons in a degree of its motor, a soft one some tenths.
+    """
+    error = (NOISE.servo**2 + (_SERVO * w).square()).sqrt()
+    return (lin.described_normal_sensitivity[pads] * error).square().sum(-1).sqrt()
+
+
+def lets_go(hand: HandDescription, piece: Piece, deviations: float) -> str:
+    """Why servos that err may let a finger go in a piece that is made from rest; empty: they do not."""
+    if piece.force is None:
+        return ""
+    lin = piece.linearization
+    rows, pads = hand.pad_rows(lin.contacts.finger)
+    least = piece.force[pads] - deviations * servo_std(lin, piece.action, rows)
+    return "servos as stiff as these may let a finger go" if bool((least < 0).any()) else ""
 
 
 class Bands:
     """Standard deviations along a path, from its beginning::
 
         Sigma = G P G' + (sum sd_g)^2 + s^2 way^2 + n^2,   G = sum d(J_m w)/d figures
-        sd_f^2 = s_f^2 + u' P_f u + (0.15 sum |df_n|)^2
+        sd_f^2 = s_f^2 + u' P_f u + (0.15 sum |df_n|)^2 + servo_std^2
 
     of the object's motion: covariance P of the hand's figures, deviation sd_g of g, share s of
     :class:`ModelError` and noise n of a motion; of the normal forces: noise and covariance of
@@ -78,7 +100,7 @@ class Bands:
         """Forces of the pads that touched at the start and their deviations; None: not measured."""
         if self._force is None or piece.force is None or piece.said is None:
             return None, None
-        _, pads = self._controller.kinematic.hand.pad_rows(piece.linearization.contacts.finger)
+        rows, pads = self._controller.kinematic.hand.pad_rows(piece.linearization.contacts.finger)
         self._pads = pads if self._pads is None else self._pads
         self._said += piece.said
         self._swing += (piece.force - self._force).abs().nan_to_num()
@@ -88,6 +110,9 @@ class Bands:
         spread = torch.full_like(force, NOISE.force)
         if self._controller.forces is not None:  # else nothing is learned of them
             spread = self._knowledge.forces.spread(self._pull, self._said, self._turned)
+        servo = torch.zeros_like(spread)
+        servo[pads] = servo_std(piece.linearization, self._pull, rows)
+        spread = (spread.square() + servo.square()).sqrt()
         return force, (spread.square() + (_SHARE * self._swing).square()).sqrt()
 
     def _of_model(self) -> Array:

@@ -13,7 +13,7 @@ import torch
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
-from .bands import Band, Bands
+from .bands import Band, Bands, lets_go
 from .decision import Decision, Piece, StopReason
 from .focus import FocusedPose, PoseTarget
 from .rehearsal import LONGEST, End, PathEnd, Rehearsal
@@ -190,6 +190,8 @@ class WholeTurn:
         for piece, state in rehearsal.pieces():
             waypoints.append(Waypoint(piece, state, bands.add(piece, state)))
             against = against or self._against(waypoints, most, spare)
+            if len(waypoints) == 1:
+                against = against or lets_go(rehearsal.hand.hand, piece, self.deviations)
             safe += not against
             left = focus.error(target, state)
             nearest = min(nearest, (left, len(waypoints)))
@@ -270,10 +272,11 @@ class WholeTurn:
             return decision
         least = math.inf if decision.grip is None else float(decision.grip.force.min())
         after = controller.focus.off_rotation(target.error(seen.state.plus(decision.predicted)))
-        if least > self.force and after <= self.off_rotation:
+        go = lets_go(controller.kinematic.hand, decision.pieces[0], self.deviations)
+        if least > self.force and after <= self.off_rotation and not go:
             return decision
         off = f"the object is {after / _DEG:.1f} deg off the axis"
-        why = f"a finger keeps {least:.1f} N" if least <= self.force else off
+        why = f"a finger keeps {least:.1f} N" if least <= self.force else go or off
         return controller.none(StopReason.GIVEN_UP, why, decision.desired)
 
 

@@ -93,7 +93,11 @@ def reachability(controller: LookAndMoveController, seen: Observation, target: P
     scaled = asked.new_tensor([[1250 * _DEG]] * 3 + [[1.0]] * 3) * lin.object_jacobian[:, moves]
     U, found, _ = torch.linalg.svd(focus.matrix @ scaled)
     gains = torch.cat([found, found.new_zeros(len(asked) - len(found))])
-    least = _WEAK * torch.linalg.matrix_norm(scaled, 2)
+    least = float(_WEAK * torch.linalg.matrix_norm(scaled, 2))
+    if _is_turn(focus):  # the whole ranges of the motors, to first order, come as far as that
+        hand = controller.kinematic.hand
+        way = float(np.linalg.norm((hand.actuator_upper - hand.actuator_lower)[moves.numpy()]))
+        least = max(least, focus.error(target, seen.state) / max(way, 1e-9))
     if gains[-1] < least:
         parts = sorted(zip(U[:, -1].abs().tolist(), map(str, focus.directions), strict=True), reverse=True)
         weak = " with ".join(name for share, name in parts if share > 0.3)

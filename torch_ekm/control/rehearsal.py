@@ -14,6 +14,7 @@ from ..exceptions import GraspError, NoContactError, UnstableGraspError
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
+from .bands import lets_go
 from .decision import Decision, Piece, StopReason
 from .focus import PoseTarget
 from .limiting import LimitingFunction
@@ -28,6 +29,8 @@ _THERE = 0.1 * _DEG  # [rad] of the error, as a turn: the path ends
 _MOST = 60  # pieces
 LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is planned when it is there
 _BENDS = 0.25 * _DEG  # of a piece beyond its linearization: it is chosen once more, about where it leads
+_HALVES = 3  # times that a piece is tried
+_DEVIATIONS = 2.0  # of servos' errors, that let no finger go
 _GRIPPED = 0.95  # of the wanted grip
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
 _SLIDES = 0.05  # of its friction, that a pad at its limit has to spare
@@ -128,8 +131,12 @@ class Rehearsal:
         target = PoseTarget(here.position, here.rotation) if self._target is None else self._target
         error = target.error(here.state)
         desired = self._limiting(focus.step_scale * (focus.matrix @ error)) / focus.step_scale
-        seen = controller.situation(lin, here.a, force, error, desired)
-        decision = controller.choose(lin, seen)
+        for _ in range(_HALVES):
+            seen = controller.situation(lin, here.a, force, error, desired)
+            decision = controller.choose(lin, seen)
+            if not any(lets_go(self.hand.hand, piece, _DEVIATIONS) for piece in decision.pieces):
+                break
+            desired = desired / 2
         found = self.hand.tangent(decision.delta_a) if decision.status is StopReason.RUNNING else None
         if found is None:
             return decision

@@ -40,6 +40,8 @@ _TAUT = 1e-6  # [N m]
 _LEAST_SLACK = 0.005  # of an actuator's range; less is a spring that just rests
 _FRACTIONS = np.linspace(0.0, 1.0, 21)  # of an actuator's range
 _LITTLE_TURN = math.radians(3.0)
+_UNPLANNED = "pinch plan"
+"""Row of a pinch that the planner refuses; one that is planned and lost is a "pinch"."""
 _DISTURBED = 3  # pinches with the faults of the preset nominal
 
 
@@ -82,8 +84,8 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
             pinch = [row._replace(remedy=first) if row.state == "error" else row for row in pinch]
         if unfit:  # no other figure cures a fault of the files
             return [*rows, *pinch]
-        planned = all(row.name != "pinch" or "planner" not in row.found for row in pinch)
-        more = _gentler(description, obj) if planned else _cured(description, obj, picture)
+        unplanned = any(row.name == _UNPLANNED for row in pinch)
+        more = _cured(description, obj, picture) if unplanned else _gentler(description, obj)
         return [*rows, *pinch, *more]
     return [*rows, *pinch, *_turn(description, obj), *_disturbed(description, obj)]
 
@@ -297,7 +299,7 @@ def _pinch(
     except MissingExtraError as error:
         yield Check("pinch", "warning", f"not tried: {error}")
     except EKMError as error:
-        what = "pinch" if seen is None else "model"
+        what = "model" if seen is not None else _UNPLANNED if isinstance(error, EquilibriumError) else "pinch"
         found = f"{error}{_lost(plant) if isinstance(error, GraspError) else ''}"
         yield Check(what, "error", found, "see docs/reference/errors.md")
     if picture is not None:

@@ -60,6 +60,8 @@ class MotionTests:
         self.guards, self.readings, self.hand, self.model = readings.guards, readings, model.hand, model
         self.servo, self.pads = servo, [pad.name for pad in model.hand.pads]
         self._least = model.options.forces.normal_std
+        held = np.vstack([model.hand.actuation_jacobian, model.hand.coupling.reshape(-1, model.hand.n_q)])
+        self._springs = bool(np.linalg.matrix_rank(held) < model.hand.n_q)
         self._usual = usual
         self.times: float | None = None
         """The same in this grasp, before its grip has changed; None: joints and springs say nothing."""
@@ -166,7 +168,10 @@ class MotionTests:
         return np.flatnonzero(found).tolist()
 
     def _by_joints(self, seen: Observation) -> dict[int, float]:
-        """Normal force of each pad in contact by joints and springs alone [N]; empty: unknown."""
+        """Normal force of each pad in contact by joints and springs alone [N]; empty: unknown, as where
+        motors and couplings hold every joint."""
+        if not self._springs:
+            return {}
         try:
             return self._normal(self.model.linearize(seen.state))
         except GraspError:

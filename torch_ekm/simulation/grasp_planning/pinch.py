@@ -15,13 +15,14 @@ from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import EquilibriumError, ParameterError
 from ...kinematics import HandKinematics
+from ...kinematics.null_space import null_space
 from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import chain, make_transmission, true_object
 from ..parameters import PlantParameters
 from .blame import BorneProblem, blame_geometry, blame_torque
 from .pinch_problem import PinchProblem, PinchRequest, opposition
-from .requirements import require_two_pads_and_limits, unmet
+from .requirements import closes_pad, require_two_pads_and_limits, unmet
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _POSTURES = 4096  # random ones, of which the best are first guesses
@@ -30,8 +31,9 @@ _STEPS = 150  # of a descent
 _STIFF_STEP = 0.002  # [s]; at 4 ms a hand with rigid actuators moves by 7 to 55 % another way
 _UNDECIDED = 0.9  # of the largest eigenvalue: fingers on a circle bend about no common axis
 _NEAR_AN_AXIS = np.cos(np.radians(15))  # the iCub's fingers bend about y to within 5 deg
-_CLOSING_POSTURES = 9  # from open to closed, in which pads are asked which one opposes the others
-_GOOD_COST = 20.0  # half a sum of squares; the wishes of a good pinch cost about 0.3
+_CLOSING_POSTURES, _SPREADS = 9, 16  # from open to closed, and in each: which pad opposes the others
+_FACES = 0.3  # cosine from which a pad opposes another
+_GOOD_COST = 40.0  # half a sum of squares; 0.3 of a good pinch of 12 joints, 35 where servos turn 16 of them
 _LITTLE = 0.1  # of the weight of torques: 1 mm of gap counts as 0.1 N m
 _BAD_COST = 100.0  # pads beside the object, or hand and object in one another
 
@@ -205,6 +207,7 @@ def _facing_postures(problem: PinchProblem) -> Iterator[Array]:
     """Of random postures those with the pads face to face, a grasp width apart."""
     low, high = problem.joint_range
     moving = low + np.random.default_rng(0).uniform(size=(_POSTURES, len(low))) * (high - low)
+    moving = problem.coupled(moving)
     facing, opening = problem.opposition(moving)
     width = problem.obj.grasp_width
     misfit = np.maximum(0.0, 0.9 - facing).max(axis=1) + np.abs(opening - width) / width
@@ -233,32 +236,42 @@ def pinch_problem(
 def opposing_pads(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
     """Names of the pad that opposes the others, and of these."""
     names = [pad.name for pad in hand.pads]
-    named = config.thumb or next((name for name in names if name.startswith("thumb")), None)
-    thumb = named or names[_most_opposed(hand)]
-    fingers = config.fingers
-    if fingers is None:
-        chosen = tuple(name for name in names if name.startswith(("index", "middle")))
-        fingers = chosen or tuple(name for name in names if name != thumb)
+    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), None)
+    fingers = config.fingers or tuple(name for name in names if name.startswith(("index", "middle")))
+    if thumb is None or not fingers:
+        thumb, others = _most_opposed(hand, names, thumb)
+        fingers = tuple(name for name in fingers or others if name != thumb)
     return thumb, fingers
 
 
-def _most_opposed(hand: HandDescription) -> int:
-    """The pad that faces the others best while the hand closes: ``max min_i`` of the pads' cosines."""
-    if len(hand.pads) < 3:
-        return 0
-    kinematics, closing = HandKinematics(hand), np.linspace(0.0, 1.0, _CLOSING_POSTURES)[:, None]
-    low, high = hand.joint_lower, hand.joint_upper
+def _most_opposed(hand: HandDescription, names: list[str], thumb: str | None) -> tuple[str, tuple[str, ...]]:
+    """The pad that faces the others best in some posture, and those that it faces there.
+
+    ``max_q mean_i max(0, min(cos_i, cos_thumb))`` decides, cosines to the line between two pads, while the
+    hand closes; joints that spread the fingers are anywhere.
+    """
+    kinematics, low, high = HandKinematics(hand), hand.joint_lower, hand.joint_upper
     ranged = np.isfinite(high - low)
-    q = np.where(ranged, low, hand.spring_rest) + closing * np.where(ranged, high - low, 0.0)
-    poses = kinematics(torch.from_numpy(q))
+    low, span = np.where(ranged, low, hand.spring_rest), np.where(ranged, high - low, 0.0)
+    closing = np.repeat(np.linspace(0.0, 1.0, _CLOSING_POSTURES), _SPREADS)[:, None]
+    closes = np.any([closes_pad(hand, pad) for pad in hand.pads], axis=0)
+    spread = np.random.default_rng(0).uniform(size=(len(closing), hand.n_q))
+    free = null_space(hand.coupling.reshape(-1, hand.n_q))
+    q = low + np.where(closes, closing, spread) * span - hand.spring_rest
+    poses = kinematics(torch.from_numpy(hand.spring_rest + q @ free @ free.T))
     T = np.stack([poses.of(pad.link).numpy() for pad in hand.pads], axis=1)
-    tips = T[..., :3, :3] @ np.array([pad.end for pad in hand.pads])[..., None]
-    tips = tips[..., 0] + T[..., :3, 3]
+    tips = (T[..., :3, :3] @ np.array([pad.end for pad in hand.pads])[..., None])[..., 0] + T[..., :3, 3]
     directions = (T[..., :3, :3] @ np.array([pad.direction for pad in hand.pads])[..., None])[..., 0]
-    pads = range(len(hand.pads))
-    orders = ([one, *(pad for pad in pads if pad != one)] for one in pads)
-    scores = [opposition(tips[:, at], directions[:, at])[0].min(axis=1).max() for at in orders]
-    return int(np.argmax(scores))
+    found = []
+    for one in range(len(names)) if thumb is None else [names.index(thumb)]:
+        others = [pad for pad in range(len(names)) if pad != one]
+        pairs = [opposition(tips[:, [one, pad]], directions[:, [one, pad]])[0].min(axis=1) for pad in others]
+        faced = np.stack(pairs, axis=1)
+        at = int(faced.clip(0.0).mean(axis=1).argmax())
+        facing = tuple(names[pad] for pad, cos in zip(others, faced[at], strict=True) if cos > _FACES)
+        found.append((float(faced[at].clip(0.0).mean()), names[one], facing))
+    _, best, facing = max(found, key=lambda one: one[0])
+    return best, facing or tuple(name for name in names if name != best)
 
 
 def turning_axis(hand: HandDescription, config: PlantConfig) -> Array:

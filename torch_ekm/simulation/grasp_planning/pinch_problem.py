@@ -26,6 +26,7 @@ from .graspable import object_axes, obstacles
 _THUMB_BENT = (0.65, 0.3, 0.3, 0.5)
 _FINGER_BENT = (0.4, 0.13, 0.12, 0.3)
 _ROOM = 0.02  # [rad] between a motor and the ends of its range
+_PULLS = 1e-9  # [1] arm of a motor that moves a pinch; less is what rounding leaves
 _CLEAR = 0.002  # [m] that other parts of the hand keep from the object
 
 
@@ -77,7 +78,7 @@ class PinchProblem:
         G f = -w_gravity                        the object is in balance
         N^T (K_s (q - q0) + J_h^T f) = 0        so are the joints that no actuator fixes,
                                                 N = null([J_a; C; dc/dq])
-        c(q) = 0                                loops close
+        C (q - q0) = 0, c(q) = 0                couplings hold, loops close
         -n_thumb . f_thumb = wanted force
 
     with soft wishes: forces well inside the friction cones, pads that meet the object with their
@@ -147,11 +148,14 @@ class PinchProblem:
         self.follow = np.zeros((hand.n_q, len(self.moving)))  # joints that a coupling drags along
         self.follow[self.moving] = np.eye(len(self.moving))
         self.follow[rest] = -np.linalg.pinv(C[:, rest]) @ C[:, self.moving]
+        ties = C @ self.follow
+        tied = np.abs(ties).max(axis=1, initial=0.0) > _PULLS  # couplings of moving joints with one another
+        self._ties, self._untied = C[tied], null_space(ties[tied])
         self._free = free = null_space(C)
         self._constant = hand.lengths.constant and hand.loops is None
         self._to_tension = np.linalg.pinv((J_a @ free).T) @ free.T
         tendon = np.array([actuator.tendon for actuator in hand.actuators], dtype=bool)
-        self.in_use: NDArray[np.bool_] = np.asarray((J_a @ self.follow).any(axis=1), dtype=bool)
+        self.in_use: NDArray[np.bool_] = np.abs(J_a @ self.follow).max(axis=1, initial=0.0) > _PULLS
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)
         self._rest()
 
@@ -230,7 +234,14 @@ class PinchProblem:
             bent = _THUMB_BENT if pad is self.pads[0] else _FINGER_BENT
             for place, joint in enumerate(chain(self.hand, pad.link)):
                 fraction[joint] = bent[min(place, 3)]
-        return low + fraction[self.moving] * (high - low)
+        return self.coupled(low + fraction[self.moving] * (high - low))
+
+    def coupled(self, moving: Array) -> Array:
+        """The nearest postures that couplings allow, whatever the limits ``(*batch, n_moving)`` [rad]."""
+        if not len(self._ties):
+            return moving
+        q0 = self._q0[self.moving]
+        return q0 + (moving - q0) @ self._untied @ self._untied.T
 
     def geometry(self, x: Array, near: NDArray[np.intp] | None = None) -> PinchGeometry:
         """Forward kinematics and distances of a batch of candidates ``(b, n_x)``.
@@ -288,6 +299,7 @@ class PinchProblem:
         passive = self._unheld(g)[:, self.moving] @ self._passive
         press = -np.einsum("bi,bi->b", g.force[:, 0], g.normal[:, 0]) - request.force
         parts = [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1]
+        parts.append((g.q - self._q0) @ self._ties.T / 1e-4)
         if (loops := self.hand.loops) is not None:
             parts.append(loops.gap(g.q) / (1e-4 * np.linalg.norm(loops.lengths.typical, axis=1)))
         return np.concatenate(parts, axis=1)
@@ -350,14 +362,14 @@ class PinchProblem:
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
-        load = self._joint_load(g)
+        load = self.joint_load(g)
         if self._constant:
             return load @ self._to_tension.T
         return self._reactions(g, load)[0][:, : self.hand.n_a]
 
     def _unheld(self, g: PinchGeometry) -> Array:
         """What of the joint load neither actuators nor loops nor couplings bear ``(batch, n_q)`` [N m]."""
-        load = self._joint_load(g)
+        load = self.joint_load(g)
         if self._constant:
             return load  # the passive motions are at right angles to all that is borne
         found, rows = self._reactions(g, load)
@@ -368,6 +380,10 @@ class PinchProblem:
         off = np.zeros_like(g.torque)
         off[:, self.moving] = self._unheld(g)[:, self.moving] @ self._passive @ self._passive.T
         return off
+
+    def passive_share(self, joint: int) -> float:
+        """How much of a torque at one joint nothing bears, 0 to 1."""
+        return float(np.square(self._passive[self.moving == joint]).sum())
 
     def slack(self, g: PinchGeometry) -> list[str]:
         """Tendons that would have to push, by name."""
@@ -384,7 +400,7 @@ class PinchProblem:
         found = np.linalg.pinv(rows.swapaxes(-1, -2), rcond=1e-9) @ (load @ self._free)[..., None]
         return found[..., 0], rows
 
-    def _joint_load(self, g: PinchGeometry) -> Array:
+    def joint_load(self, g: PinchGeometry) -> Array:
         """What springs and contacts ask of the tendons, for moment arms J_a, ``(batch, n_q)`` [N m]."""
         T = self.transmission
         inner = g.q + T.lean(g.torque)

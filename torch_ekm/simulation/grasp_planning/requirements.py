@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ...description import ContactPad, HandDescription
 from ...exceptions import DescriptionError
@@ -59,19 +60,16 @@ def direction_unmet(hand: HandDescription, pad: ContactPad) -> Unmet | None:
     joints = chain(hand, pad.link)
     if not joints:
         return None  # part of the palm
-    kinematics = HandKinematics(hand)
-    poses = kinematics(torch.from_numpy(hand.spring_rest))
-    T = poses.of(pad.link).numpy()
-    axis, origin = (part.numpy() for part in kinematics.joint_axes(poses))
-    towards, tip = T[:3, :3] @ pad.direction, T[:3, :3] @ pad.end + T[:3, 3]
+    T, velocity, along = _motions(hand, pad)
     for joint in joints:
-        velocity = np.cross(axis[joint], tip - origin[joint])
-        along = float(towards @ velocity / max(np.linalg.norm(velocity), 1e-9))
-        if abs(along) < _FACING:
+        if abs(along[joint]) < _FACING:
             continue
-        if _closing(hand, joint) * along >= 0:
+        if _closing(hand, joint) * along[joint] >= 0:
             return None
-        name, closes = hand.joint_names[joint], (T[:3, :3].T @ (-np.sign(along) * velocity)).round(4)
+        name, closes = (
+            hand.joint_names[joint],
+            (T[:3, :3].T @ (-np.sign(along[joint]) * velocity[joint])).round(4),
+        )
         return Unmet(
             f"pad '{pad.name}'",
             f"its direction {_text(pad.direction)} points away from where joint '{name}' closes it",
@@ -82,6 +80,24 @@ def direction_unmet(hand: HandDescription, pad: ContactPad) -> Unmet | None:
         f"no joint moves it along its direction {_text(pad.direction)}",
         f"'direction' is the palmar side, in the frame of '{pad.link}'",
     )
+
+
+def closes_pad(hand: HandDescription, pad: ContactPad) -> NDArray[np.bool_]:
+    """Which joints move a pad along its direction, at rest ``(n_q,)``."""
+    moves = np.isin(np.arange(hand.n_q), chain(hand, pad.link))
+    return np.asarray(moves & (np.abs(_motions(hand, pad)[2]) >= _FACING))
+
+
+def _motions(hand: HandDescription, pad: ContactPad) -> tuple[Array, Array, Array]:
+    """Pose of a pad's link at rest, velocity of the pad as each joint turns ``(n_q, 3)``, and the cosine
+    between this and its direction ``(n_q,)``."""
+    kinematics = HandKinematics(hand)
+    poses = kinematics(torch.from_numpy(hand.spring_rest))
+    T = poses.of(pad.link).numpy()
+    axis, origin = (part.numpy() for part in kinematics.joint_axes(poses))
+    velocity = np.cross(axis, T[:3, :3] @ pad.end + T[:3, 3] - origin)
+    speed = np.linalg.norm(velocity, axis=1).clip(1e-9)
+    return T, velocity, velocity @ (T[:3, :3] @ pad.direction) / speed
 
 
 def unmet(problem: PinchProblem) -> list[Unmet]:
@@ -127,7 +143,7 @@ def _closing(hand: HandDescription, joint: int) -> int:
 def _opposing(problem: PinchProblem, low: Array, high: Array) -> int:
     """How many of the sampled postures have the pads face to face, about a grasp width apart."""
     moving = low + np.random.default_rng(0).uniform(size=(_SAMPLES, len(low))) * (high - low)
-    facing, opening = problem.opposition(moving)
+    facing, opening = problem.opposition(problem.coupled(moving))
     width = problem.obj.grasp_width
     return int(((facing.min(axis=1) > _FACING) & (np.abs(opening - width) < 0.5 * width)).sum())
 

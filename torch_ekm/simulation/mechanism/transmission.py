@@ -11,8 +11,8 @@ from ...description.lengths import Lengths
 from ...typing import Array
 from .departures import CableLosses, JointShape
 
-_COUPLING_STIFFNESS = 8.0  # k_c [N m/rad]
-_LOOP_STIFFNESS = 100.0  # [N m/rad] at the joints of a loop: as rigid as an actuator may be
+_COUPLING_STIFFNESS = 8.0  # [N m/rad] at least, of a coupling between fingers: twice that of the motors
+_LOOP_STIFFNESS = 100.0  # [N m/rad] of loops, and couplings within a finger: as rigid as an actuator may be
 _BRISTLE_STIFFNESS = 3.0  # k_f [N m/rad]
 _LEANS = 5e-3  # [N m] from which a joint with play is at its end; smooth, as a planner needs it
 _STIFF = 20.0  # [N m/rad] at a joint; up to here the late part damps little
@@ -70,7 +70,7 @@ class Transmission:
         self._lengths = None if hand.lengths.constant else hand.lengths
         self._springs, self._loops = hand.tendon_springs, hand.loops
         self._M = np.vstack([self._lead, away[np.abs(away).max(axis=1) > 0]])
-        self._k = np.concatenate([stiffness, np.full(len(coupling), _COUPLING_STIFFNESS)])
+        self._k = np.concatenate([stiffness, self._coupling_stiffness(hand, coupling)])
         self._pulls_only = np.concatenate(
             [[actuator.tendon for actuator in hand.actuators], np.zeros(len(coupling), bool)]
         ).astype(bool)
@@ -85,8 +85,8 @@ class Transmission:
         self._bends = self._reach(self.friction)
         varied = 1.0 if self._lengths is None else hand.lengths.largest(*limits)
         tied = list(self._tied(limits))
-        strong = [(stiffness, self.J_a * varied), *tied]
-        self.stiff = bool(max((k[:, None] * arms**2).max() for k, arms in strong) > _STIFF)
+        strong = [(stiffness, self.J_a * varied), (self._k[self.n_a :], self._M[self.n_a :]), *tied]
+        self.stiff = bool(max((k[:, None] * arms**2).max(initial=0.0) for k, arms in strong) > _STIFF)
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
         self._compliance = self.losses.compliance(stiffness)
         steep = self._k.copy()
@@ -100,6 +100,15 @@ class Transmission:
         self.drive_stiffness = self._turned + self._k_f
         """Stiffness of each joint's drive ``(n_q,)`` [N m/rad], while all tendons are taut."""
         self.relax(self.spring_rest)
+
+    @staticmethod
+    def _coupling_stiffness(hand: HandDescription, coupling: Array) -> Array:
+        """``k_c`` of each coupling [N m/rad]: what bears in the linkage of a finger is rigid."""
+        between = max(_COUPLING_STIFFNESS, *(2 * actuator.stiffness for actuator in hand.actuators))
+        fingers = [{joint.name for joint in hand.urdf.joints_to(pad.link)} for pad in hand.pads]
+        tied = [{hand.joint_names[joint] for joint in np.flatnonzero(row)} for row in coupling]
+        linkage = [len(tie) > 1 and any(tie <= finger for finger in fingers) for tie in tied]
+        return np.where(linkage, _LOOP_STIFFNESS, between)
 
     def _tied(self, limits: tuple[Array, Array]) -> Iterator[tuple[Array, Array]]:
         """Stiffnesses and largest arms of tendon springs and loops."""
