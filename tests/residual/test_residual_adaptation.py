@@ -176,55 +176,47 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
         assert float(seen) < float(loss) - 1e-3  # what was seen flatters itself
 
 
-def filled_memory(n: int, capacity: int, horizon: float = math.inf) -> ReplayMemory:
+def filled_memory(n: int, capacity: int) -> ReplayMemory:
     posterior = sogp(1, 1, capacity=2).posterior
-    memory = ReplayMemory(posterior, capacity, horizon)
+    memory = ReplayMemory(posterior, capacity)
     for i in range(n):
         value = torch.tensor([float(i)], dtype=torch.float64)
-        memory.offer(value, -value, torch.ones((), dtype=torch.float64))
+        memory.offer(i, value, -value, torch.ones((), dtype=torch.float64))
     memory.settle()
     return memory
 
 
-def test_memory_is_an_even_sample_of_the_past():
-    memory = filled_memory(20_000, 500)
-    kept = memory.x[:, 0]
-    assert len(kept.unique()) == 500
-    torch.testing.assert_close(memory.y[:, 0], -kept)
-    share = torch.histc(kept, bins=10, min=0, max=20_000) / 500
-    # a tenth each, standard deviation .013
-    assert float((share - 0.1).abs().max()) < 0.04
-
-
-def test_memory_of_a_learner_that_forgets_fades_as_it_does():
-    memory = filled_memory(20_000, 2_000, horizon=300.0)
-    age = 19_999 - memory.x[:, 0]
-    assert memory.capacity == 300
-    # exponential: mean 300, a share exp(-1) is older than that
-    assert 240 < float(age.mean()) < 360
-    assert 0.28 < float((age > 300).double().mean()) < 0.46
-    longer = filled_memory(20_000, 200, horizon=1000.0)
-    assert 750 < float((19_999 - longer.x[:, 0]).mean()) < 1250
+def test_memory_holds_the_last_samples_and_knows_their_age():
+    x, y, weight, age = filled_memory(1_234, 500).take(1_234, 500)
+    assert sorted(x[:, 0].tolist()) == list(range(734, 1_234))
+    assert torch.equal(y, -x)
+    assert torch.equal(age, 1_234 - x[:, 0])
+    assert bool((weight == 1.0).all())
 
 
 def test_turns_go_through_the_whole_memory():
     memory = filled_memory(500, 500)
-    seen = torch.cat([memory.take(64)[0][:, 0] for _ in range(7)])
+    seen = torch.cat([memory.take(500, 64)[0][:, 0] for _ in range(7)])
     assert len(seen) == len(seen.unique()) == 7 * 64
-    assert len(filled_memory(10, 500).take(64)[0]) == 10
-    assert len(filled_memory(0, 500).take(64)[0]) == 0
+    assert len(filled_memory(10, 500).take(10, 64)[0]) == 10
+    assert len(filled_memory(0, 500).take(0, 64)[0]) == 0
 
 
 def test_what_is_not_yet_part_of_the_state_is_not_taken_for_seen():
     memory = filled_memory(100, 500)
-    memory.offer(torch.ones(1).double(), torch.ones(1).double(), torch.ones(()).double())
-    weight = memory.take(500)[2]
+    memory.offer(100, torch.ones(1).double(), torch.ones(1).double(), torch.ones(()).double())
+    weight = memory.take(101, 500)[2]
     assert float(weight.sum()) == 100
     assert float(weight[100]) == 0
     memory.settle()
-    assert float(memory.take(500)[2].sum()) == 101
+    assert float(memory.take(101, 500)[2].sum()) == 101
     memory.forget(torch.tensor(True))
-    assert float(memory.take(500)[2].sum()) == 0
+    assert float(memory.take(101, 500)[2].sum()) == 0
+
+
+def test_a_learner_that_forgets_keeps_no_more_than_it_knows():
+    parts = [ForgettingFactor(0.99), LearnHyperparameters(memory=2000)]
+    assert past_of(sogp(4, 2, parts=parts)).capacity == 100
 
 
 def test_adaptation_beats_a_wrong_start():

@@ -39,6 +39,13 @@ def stream(n: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return x, y + 0.05 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
 
 
+def observe(scale: RunningScale, n: int, x: torch.Tensor, on: torch.Tensor | None = None) -> None:
+    """Keep the sample after n, and take in a block that is full."""
+    scale.observe(n % BLOCK, x, on)
+    if n % BLOCK == BLOCK - 1:
+        scale.pool()
+
+
 def error(learner, x: torch.Tensor, y: torch.Tensor) -> float:
     """rms error of what it predicts, over that of the model alone."""
     return float((learner(x) - y).square().mean().sqrt() / y.square().mean().sqrt())
@@ -134,7 +141,7 @@ def test_a_slow_change_of_scale_is_followed():
     scale = RunningScale(3, [True] * 3)
     scale.memory = 300
     for t in range(n):
-        scale.observe(t % BLOCK, x[t], None)
+        observe(scale, t, x[t])
     scale.settle()
     torch.testing.assert_close(scale.scale, torch.full_like(scale.scale, 8.5), rtol=0.2, atol=0.0)
 
@@ -146,7 +153,7 @@ def test_what_rests_keeps_its_units():
     x = torch.randn(4000, 1, generator=generator, dtype=torch.float64)
     x[1000:] *= 1e-6
     for t in range(len(x)):
-        scale.observe(t % BLOCK, x[t], None)
+        observe(scale, t, x[t])
     scale.settle()
     assert 0.3 < float(scale.scale) < 1.2
 
@@ -156,8 +163,7 @@ def test_new_units_change_no_prediction():
     x, y = stream(40)
     learner = SparseOnlineGP(3, 2, capacity=50, parts=[Standardize(output_offset="learned")])
     learner.update(x, y + 5.0)
-    units = learner.part(Standardize)
-    assert units is not None
+    units = learner.units
     precision = learner.posterior.precision.sum(-1, keepdim=True)
     old = learner.posterior.information * units.output.scale + precision * units.output.shift
     units.output.centre += 2.0
@@ -173,7 +179,7 @@ def test_units_are_told_and_kept():
     learner = SparseOnlineGP(3, 2)
     learner.update(x * 1e3, y)
     assert "scale=" in repr(learner)
-    assert math.isclose(float(learner.state_dict()["parts.0.input.scale"][0]), 1e3, rel_tol=0.3)
+    assert math.isclose(float(learner.state_dict()["units.input.scale"][0]), 1e3, rel_tol=0.3)
 
 
 def test_bursts_are_no_outliers():
@@ -187,7 +193,7 @@ def test_bursts_are_no_outliers():
     for on in (burst, alone):
         scale = RunningScale(1)
         for n, x in enumerate(torch.where(on, large, small)):
-            scale.observe(n % BLOCK, x, None)
+            observe(scale, n, x)
         scale.settle()
         found.append(float(scale.scale))
     assert found[0] > 0.04
@@ -212,7 +218,7 @@ def test_arrays_are_pooled_as_tensors_are(fleet, monkeypatch):
             for scale, plain in ((ours, running_scale.is_plain), (theirs, lambda *_: False)):
                 with monkeypatch.context() as patch:
                     patch.setattr(running_scale, "is_plain", plain)
-                    scale.observe(place, x[place], None if block % 2 else on[place].double())
+                    observe(scale, place, x[place], None if block % 2 else on[place].double())
         for name in ("weight", "centre", "spread", "large"):
             torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-10, atol=1e-300)
         if block % 3 == 0:

@@ -41,8 +41,8 @@ class RunningScale(nn.Module):
     Exempt columns are scaled by their root mean square. Nothing is squared before it is divided by the
     largest: 1e150 is a number like others. A past that is 1e20 times as large as what comes is forgotten.
 
-    :meth:`observe` takes samples in, :meth:`settle` adopts what was found. In between ``shift`` and ``scale``
-    stand still, so that what was computed with them stays valid.
+    :meth:`observe` keeps samples, :meth:`pool` takes a full block of them in, :meth:`settle` adopts what was
+    found. In between ``shift`` and ``scale`` stand still, so that what was computed with them stays valid.
 
     An input that stood still has the scale of its jitter until it moves: then its z is of any size. What
     grows with z without end takes it for ``REACH`` at most.
@@ -86,34 +86,31 @@ class RunningScale(nn.Module):
         self.reach = nn.Buffer(torch.tensor(reach, **factory), persistent=False)
 
     def forward(self, x: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch features"]:
-        """x, or its first columns, in the learner's units."""
-        n = x.shape[-1]
-        return self._cut((x - self.shift[..., :n]) / self.scale[..., :n])
+        """x in the learner's units."""
+        return self._cut((x - self.shift) / self.scale)
 
     def of_sets(self, x: Float[Tensor, "*batch n features"]) -> Float[Tensor, "*batch n features"]:
         """n samples of each model in the learner's units."""
         return self._cut((x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2))
 
     def _cut(self, z: Tensor) -> Tensor:
-        reach = self.reach[: z.shape[-1]]
-        return z.clamp(-reach, reach) if self.cuts else z
+        return z.clamp(-self.reach, self.reach) if self.cuts else z
 
     def follows(self, z: Float[Tensor, "*any features"]) -> Bool[Tensor, "*any features"]:
         """Columns in which z changes with x: where it was not cut."""
         return z.abs() < self.reach
 
     def observe(self, place: int, x: Float[Tensor, "*batch features"], on: Tensor | None) -> None:
-        """A sample ``(*batch, features)`` of the models ``on``, at its place in the block; the last pools.
-
-        ``on`` None: all models.
-        """
+        """Keep a sample of the models ``on``, at its place in the block; None: of all."""
         write(self.block, place, x)
         row = self.block_on.select(-2, place)
         row.fill_(1.0) if on is None else row.copy_(on.unsqueeze(-1))
-        if place == BLOCK - 1:
-            pooled = self.weight, self.centre, self.spread, self.large
-            for buffer, found in zip(pooled, _pooled(self), strict=True):
-                buffer.copy_(torch.as_tensor(found))
+
+    def pool(self) -> None:
+        """Take the full block in."""
+        pooled = self.weight, self.centre, self.spread, self.large
+        for buffer, found in zip(pooled, _pooled(self), strict=True):
+            buffer.copy_(torch.as_tensor(found))
 
     def settle(self, *, young: bool = False, settled: float = 0.1) -> tuple[Tensor, Tensor]:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
@@ -158,6 +155,51 @@ class RunningScale(nn.Module):
             return f"features={self.scale.shape[-1]}"
         shift, scale = ([float(f"{v:.3g}") for v in b.flatten().tolist()] for b in (self.shift, self.scale))
         return f"shift={shift}, scale={scale}"
+
+
+class Units(nn.Module):
+    """The units in which a learner works, ``z = (x - shift) / scale``, and y the same: 0 and 1 at first.
+
+    Args:
+        input, output: scales of x and y.
+    """
+
+    def __init__(self, input: RunningScale, output: RunningScale) -> None:
+        super().__init__()
+        self.input, self.output = input, output
+
+    def of_sets(
+        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"]
+    ) -> tuple[Tensor, Tensor]:
+        """n samples of each model in the learner's units."""
+        return self.input.of_sets(x), self.output.of_sets(y)
+
+    def value(self, value: Float[Tensor, "*any out_or_1"], power: int) -> Tensor:
+        """An output in its own unit, or (power 2) a variance in its square."""
+        scale = self.output.scale
+        return value * scale + self.output.shift if power == 1 else value * scale.square()
+
+    def slope(
+        self, slope: Float[Tensor, "*any out_or_1 in"], power: int, z: Float[Tensor, "*any in"]
+    ) -> Float[Tensor, "*any out in"]:
+        """The derivative of such a value by x; z is that x in the learner's units."""
+        slope = slope * self.output.scale.pow(power).unsqueeze(-1) / self.input.scale.unsqueeze(-2)
+        return slope * self.input.follows(z).unsqueeze(-2) if self.input.cuts else slope
+
+    def observe(self, place: int, x: Tensor, y: Tensor, on: Tensor | None) -> None:
+        """Keep a sample at its place in the block, see RunningScale."""
+        self.input.observe(place, x, on)
+        self.output.observe(place, y, on)
+
+    def pool(self) -> None:
+        """Take the full block in."""
+        self.input.pool()
+        self.output.pool()
+
+    def reset(self) -> None:
+        """Back to z = x, t = y."""
+        self.input.reset()
+        self.output.reset()
 
 
 def _pooled(scale: RunningScale) -> tuple[AnyArray, ...]:

@@ -14,7 +14,7 @@ from ...typing import Bool, Float, Tensor
 from ..base import ResidualLearner
 from ..misled import Misled
 from ..report import UpdateReport
-from ..running_scale import BLOCK, RunningScale
+from ..running_scale import BLOCK, RunningScale, Units
 
 _FAR = 2.3  # logarithm of a change of units after which a learner starts again
 _CUT = 6.0  # largest target in its own units
@@ -65,10 +65,12 @@ class ScaledLearner(ResidualLearner):
     def _make_units(self, shifted: list[bool], dtype: torch.dtype, grows: list[bool] | None = None) -> None:
         """Last in a constructor."""
         options = {"batch_shape": self.batch_shape, "dtype": dtype, "device": self.device}
-        if self.standardize:
-            centred = [self.output_offset == "learned"] * self.out_features
-            self.input = RunningScale(self.in_features, shifted, grows, self._least[0], **options)
-            self.output = RunningScale(self.out_features, centred, least=self._least[1], **options)
+        centred = [self.output_offset == "learned"] * self.out_features
+        (resolution, least), grows = self._least, grows if self.standardize else None
+        self.units = Units(
+            RunningScale(self.in_features, shifted, grows, resolution, **options),
+            RunningScale(self.out_features, centred, least=least, **options),
+        )
 
     # -- f, in its own units --------------------------------------------------------------------
 
@@ -108,9 +110,7 @@ class ScaledLearner(ResidualLearner):
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Mean and deviation of g, or of y."""
         mean, variance = self._law(self._inputs(self.check_query(x)), observation)
-        deviation = variance.sqrt().expand_as(mean)
-        if self.standardize:
-            deviation = deviation * self.output.scale
+        deviation = variance.sqrt().expand_as(mean) * self.units.output.scale
         return Normal(self._value(mean), deviation.to(self.dtype), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -118,17 +118,14 @@ class ScaledLearner(ResidualLearner):
             return super().linearize(x)
         z = self._inputs(self.check_query(x))
         mean, slope = self._slopes(z)
-        if self.standardize:
-            slope = slope * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
-            slope = slope * self.input.follows(z).unsqueeze(-2)
-        return self.bounded_slope(self._unbounded(mean), slope.to(self.dtype))
+        mean, slope = self.units.value(mean, 1), self.units.slope(slope, 1, z)
+        return self.bounded_slope(mean.to(self.dtype), slope.to(self.dtype))
 
     def slope_deviation(self, x: Tensor) -> Tensor:
         """Of the same for all outputs, but for their scales."""
         z = self._inputs(self.check_query(x))
         deviation = self._slope_variance(z).clamp_min(0.0).sqrt().unsqueeze(-2)
-        if self.standardize:
-            deviation = deviation * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
+        deviation = self.units.slope(deviation, 1, torch.zeros_like(z))
         return deviation.expand(*deviation.shape[:-2], self.out_features, -1).to(self.dtype)
 
     def reset(self) -> None:
@@ -138,35 +135,31 @@ class ScaledLearner(ResidualLearner):
         self.n_samples = 0
         self.misled.level.zero_()
         self._clear()
-        if self.standardize:
-            self.input.reset()
-            self.output.reset()
+        self.units.reset()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if self.standardize:
             self._observe(x, y, mask)
         self.n_samples += 1
-        z = self._inputs(x)
-        t = self.output(y) if self.standardize else y
+        z, t = self._inputs(x), self.units.output(y)
         self.misled.observe(t - self._mean(z), t, mask)
         misled = self.misled.found()
         if misled is not None:
             self._clear(misled)
-            if self.standardize:
-                self.output.forget(misled)
+            self.units.output.forget(misled)
         return self._learn(z, self._targets(y), mask)
 
     def _observe(self, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         n, on = self.n_samples, None if mask is None else mask.to(x.dtype)
-        place = n % BLOCK
-        self.input.observe(place, x, on)
-        self.output.observe(place, y, on)
+        units = self.units
+        units.observe(n % BLOCK, x, y, on)
         if n + 1 < BLOCK and n & (n + 1) == 0:
-            self.input.settle(young=True)
-            self.output.settle(young=True)
+            units.input.settle(young=True)
+            units.output.settle(young=True)
             self._learn_block(n)
         elif (n + 1) % BLOCK == 0:
-            changes = self.input.settle(settled=self.settled), self.output.settle(settled=self.settled)
+            units.pool()
+            changes = units.input.settle(settled=self.settled), units.output.settle(settled=self.settled)
             ratios = torch.cat([changes[0][1], changes[1][1]], dim=-1).log().abs()
             if bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
                 self._follow(*changes)
@@ -177,27 +170,23 @@ class ScaledLearner(ResidualLearner):
     def _learn_block(self, n: int, models: Bool[Tensor, "*batch"] | None = None) -> None:
         """Again, from the first n samples of the present block only; all models, or these."""
         self._clear(models)
+        input, output = self.units.input, self.units.output
         for i in range(n):
-            on = self.input.block_on[..., i, 0] * self.output.block_on[..., i, 0] > 0
+            on = input.block_on[..., i, 0] * output.block_on[..., i, 0] > 0
             on = on if models is None else on & models
             if not bool(on.any()):  # nothing, or of a time that is forgotten
                 continue
-            x, y = self.input.block[..., i, :], self.output.block[..., i, :]
+            x, y = input.block[..., i, :], output.block[..., i, :]
             self._learn(self._inputs(x), self._targets(y), on if self.batch_shape else None)
 
     def _inputs(self, x: Float[Tensor, "*any in"]) -> Tensor:
-        return self.input(x) if self.standardize else x
+        return self.units.input(x)
 
     def _targets(self, y: Float[Tensor, "*batch out"]) -> Tensor:
-        return self.output(y).clamp(-_CUT, _CUT) if self.standardize else y
+        return self.units.output(y).clamp(-_CUT, _CUT) if self.standardize else y
 
     def _value(self, mean: Float[Tensor, "*any out"]) -> Tensor:
-        return self.bounded(self._unbounded(mean))
-
-    def _unbounded(self, mean: Float[Tensor, "*any out"]) -> Tensor:
-        if self.standardize:
-            mean = mean * self.output.scale + self.output.shift
-        return mean.to(self.dtype)
+        return self.bounded(self.units.value(mean, 1).to(self.dtype))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm continues after a reload."""

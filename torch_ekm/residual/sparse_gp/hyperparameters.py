@@ -13,9 +13,8 @@ from ...typing import Bool, Float, Tensor
 from ..adam import Adam
 from ..kernels.kernel import is_shared
 from ..running_scale import write
-from . import plan as P
 from .forgetting import ForgettingFactor, ProcessNoise
-from .monitor import DetectChanges, RobustWeight
+from .monitor import RobustWeight
 from .part import Host, Part, Sample
 from .prequential_loss import PrequentialLoss, Queries
 from .replay import ReplayMemory
@@ -85,47 +84,29 @@ class LearnHyperparameters(Part):
         self.adam = Adam(parameters, betas=(0.9, 0.99))
         for i, p in enumerate(parameters):
             self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
-        horizon = math.inf if factor == 1.0 else 1.0 / (1.0 - factor)
-        if learner.part(DetectChanges) is not None:  # so that the new system's samples are let in at once
-            horizon = min(horizon, self.memory)
-        self.past = ReplayMemory(posterior, self.memory, horizon) if self.memory else None
+        # no more than what a learner remembers that forgets
+        known = self.memory if factor == 1.0 else min(self.memory, math.ceil(1.0 / (1.0 - factor)))
+        self.past = ReplayMemory(posterior, known) if known else None
 
-    def compiled(self) -> dict[int, Tensor | int]:
-        """Where compiled loops keep samples, see :mod:`.plan`."""
-        fields: dict[int, Tensor | int] = {
-            P.WINDOW_X: self.window_x, P.WINDOW_Y: self.window_y, P.WINDOW: self.window_on,
-            P.WINDOW_SIZE: self.window,
-        }  # fmt: skip
-        if self.past is not None:
-            fields |= {
-                P.PAST_X: self.past.x, P.PAST_Y: self.past.y, P.PAST: self.past.weight,
-                P.PAST_ABSORBED: self.past.absorbed, P.PAST_NUMBER: self.past.number,
-                P.PAST_SIZE: self.past.capacity,
-            }  # fmt: skip
-        return fields
-
-    def places(self, n: int, learner: Host) -> tuple[int, int]:
-        """Of the sample after n, in the window and the memory (-1: none)."""
-        place = (n - learner.refresh_offset) % self.window
-        return place, -1 if self.past is None else self.past.next_place()
+    def place(self, learner: Host) -> int:
+        """Of the present sample in the window."""
+        return (learner.n_samples - learner.refresh_offset) % self.window
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
-        """Keep the sample, in its own units; with a full window, descend."""
-        place = (learner.n_samples - learner.refresh_offset) % self.window
+        """Keep the sample, in its own units."""
+        place = self.place(learner)
         x, y, weight = sample.x, sample.y, sample.report.weight
         weight = weight if sample.mask is None else weight * sample.mask
         write(self.window_x, place, x)
         write(self.window_y, place, y)
         self.window_on.select(-1, place).copy_(weight)
         if self.past is not None:
-            self.past.offer(x, y, weight)
-        self.act(learner)
+            self.past.offer(learner.n_samples, x, y, weight)
         return False
 
     def act(self, learner: Host) -> None:
-        """After the notes of a sample: descend, and move the parameters, when it is time."""
-        n = learner.n_samples
-        place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
+        """Descend, and move the parameters, when it is time."""
+        place, due = self.place(learner), learner.is_due(learner.n_samples + 1)
         between = (place + 1) * self.steps // self.window > place * self.steps // self.window
         if due or (between and place + 1 < self.window):
             if moved := due and self.steps > 1:
@@ -162,7 +143,7 @@ class LearnHyperparameters(Part):
         absorbed = age = x.new_zeros(self.window)
         if self.past is not None:
             n = max(_REPLAYED * self.window, learner.posterior.capacity)
-            x_past, y_past, weight_past, age_past = self.past.take(n)
+            x_past, y_past, weight_past, age_past = self.past.take(learner.n_samples + 1, n)
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
             weight = torch.cat([weight, weight_past], dim=-1)
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])

@@ -10,7 +10,6 @@ from torch import nn
 from ..._checks import check_positive
 from ...typing import Float, Tensor
 from ..misled import Misled
-from . import plan as P
 from .part import Host, Part, Sample
 
 CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
@@ -72,10 +71,6 @@ class CalibrateNoise(Part):
         """Factors c = 1 on the noise of all outputs."""
         self.log_factor = nn.Buffer(torch.zeros_like(learner.log_noise_variance))
 
-    def compiled(self) -> dict[int, Tensor]:
-        """Where compiled loops move c, see :mod:`.plan`."""
-        return {P.FACTOR: self.log_factor}
-
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Move c by whether this innovation lay outside of its interval."""
         noise = learner.log_noise_variance.exp()
@@ -114,23 +109,15 @@ class DetectChanges(Part):
         self.levels = nn.Buffer(zeros(RING_SIZE, *fleet))
         self.misled = Misled(fleet, self.level.dtype, self.level.device)
 
-    def compiled(self) -> dict[int, Tensor | int]:
-        """Where compiled loops keep samples, see :mod:`.plan`."""
-        return {
-            P.CHANGED: self.level, P.RING_X: self.inputs, P.RING_Y: self.targets, P.RING: self.levels,
-            P.MISLED: self.misled.level,
-        }  # fmt: skip
-
     def after_update(self, learner: Host, sample: Sample) -> bool:
-        """Take a sample in; models that face another system start again."""
+        """Take a sample in."""
         place, mask = learner.n_samples % RING_SIZE, sample.mask
         large = (sample.report.nis > LARGE).to(self.level.dtype)
         self.level.lerp_(large, RATE) if mask is None else self.level.lerp_(large, RATE * mask)
         level = self.level if mask is None else self.level.where(mask > 0, math.inf)  # inf: no sample
         for kept, value in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
             kept.select(0, place).copy_(value)
-        self.misled.observe(sample.innovation, learner.units.targets(sample.y), mask)
-        self.act(learner)
+        self.misled.observe(sample.innovation, learner.units.output(sample.y), mask)
         return False
 
     def act(self, learner: Host) -> None:
@@ -139,7 +126,7 @@ class DetectChanges(Part):
         changed = self.level > ALARM
         if misled is not None:
             changed = changed | misled
-            learner.units.forget(misled)
+            learner.units.output.forget(misled)
         if bool(changed.any()):
             self.level.masked_fill_(changed, COOL)
             x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
