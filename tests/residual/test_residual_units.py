@@ -39,13 +39,6 @@ def stream(n: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return x, y + 0.05 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
 
 
-def observe(scale: RunningScale, n: int, x: torch.Tensor, on: torch.Tensor | None = None) -> None:
-    """Keep the sample after n, and take in a block that is full."""
-    scale.observe(n % BLOCK, x, on)
-    if n % BLOCK == BLOCK - 1:
-        scale.pool()
-
-
 def error(learner, x: torch.Tensor, y: torch.Tensor) -> float:
     """rms error of what it predicts, over that of the model alone."""
     return float((learner(x) - y).square().mean().sqrt() / y.square().mean().sqrt())
@@ -125,8 +118,8 @@ def test_least_squares_in_single_precision_far_from_the_origin():
 def test_an_offset_of_the_outputs(kind):
     """Far from all samples the prediction is the mean of y, whose size does not matter."""
     x, y = stream(150)
-    own = {"standardize": Standardize(output_offset="learned")} if kind in ("sogp", "deep") else {}
-    learner = SMALL[kind](**own or {"output_offset": "learned"})
+    learned = {"output_offset": "learned"}
+    learner = SMALL[kind](**learned if kind == "default" else {"standardize": Standardize(**learned)})
     assert torch.equal(learner(x[:2]), torch.zeros(2, 2, dtype=torch.float64))
     learner.update(x, y + 300.0)
     assert float((learner(x) - y - 300.0).square().mean().sqrt()) < 0.45
@@ -140,8 +133,8 @@ def test_a_slow_change_of_scale_is_followed():
     x = stream(n)[0] * growth
     scale = RunningScale(3, [True] * 3)
     scale.memory = 300
-    for t in range(n):
-        observe(scale, t, x[t])
+    for block in x.split(BLOCK):
+        scale.pool(block, torch.ones(len(block)).double())
     scale.settle()
     torch.testing.assert_close(scale.scale, torch.full_like(scale.scale, 8.5), rtol=0.2, atol=0.0)
 
@@ -152,8 +145,8 @@ def test_what_rests_keeps_its_units():
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(4000, 1, generator=generator, dtype=torch.float64)
     x[1000:] *= 1e-6
-    for t in range(len(x)):
-        observe(scale, t, x[t])
+    for block in x.split(BLOCK):
+        scale.pool(block, torch.ones(len(block)).double())
     scale.settle()
     assert 0.3 < float(scale.scale) < 1.2
 
@@ -192,8 +185,8 @@ def test_bursts_are_no_outliers():
     found = []
     for on in (burst, alone):
         scale = RunningScale(1)
-        for n, x in enumerate(torch.where(on, large, small)):
-            observe(scale, n, x)
+        for block in torch.where(on, large, small).split(BLOCK):
+            scale.pool(block, torch.ones(BLOCK).double())
         scale.settle()
         found.append(float(scale.scale))
     assert found[0] > 0.04
@@ -214,11 +207,11 @@ def test_arrays_are_pooled_as_tensors_are(fleet, monkeypatch):
             x[..., 3] = 7.0
         if block == 40:
             x[..., 1] *= 1e-30
-        for place in range(BLOCK):
-            for scale, plain in ((ours, running_scale.is_plain), (theirs, lambda *_: False)):
-                with monkeypatch.context() as patch:
-                    patch.setattr(running_scale, "is_plain", plain)
-                    observe(scale, place, x[place], None if block % 2 else on[place].double())
+        on, x = (on | bool(block % 2)).double().movedim(0, -1), x.movedim(0, -2)
+        for scale, plain in ((ours, running_scale.is_plain), (theirs, lambda *_: False)):
+            with monkeypatch.context() as patch:
+                patch.setattr(running_scale, "is_plain", plain)
+                scale.pool(x, on)
         for name in ("weight", "centre", "spread", "large"):
             torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-10, atol=1e-300)
         if block % 3 == 0:

@@ -163,20 +163,11 @@ class MixtureResidual(MixtureQueries):
             learner.new_sequence()
         self._settle()
 
-    def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
-        """See :meth:`ResidualLearner.update`; single samples that the engine accepts skip its checks."""
-        if mask is None:
-            with self.lock:
-                report = self._engine.learn(self, x, y, None)
-                if report is not None:
-                    return report
-        return super().update(x, y, mask)
+    def at_once(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        return self._engine.learn(self, x, y, mask)
 
     @torch.no_grad()
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        report = self._engine.learn(self, x, y, mask)
-        if report is not None:
-            return report
         moments = [learner.moments(x, observation=True) for learner in self.members]
         nis, *said = self._judged(x, y, mask, moments)
         reports = [learner.step(x, y, mask) for learner in self.members]

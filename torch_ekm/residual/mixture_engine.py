@@ -45,7 +45,7 @@ class CompiledMixture:
 
     def __init__(self) -> None:
         self._bound: Bound | None = None
-        self._plans: list[Plan | None] = []
+        self._plans: list[Any] = []  # one Plan for each learner, or None
 
     def __deepcopy__(self, memo: dict) -> CompiledMixture:
         return CompiledMixture()
@@ -68,7 +68,6 @@ class CompiledMixture:
         loops.query_mixture(bound.row, self._members, x.data_ptr(), *(t.data_ptr() for t in found))
         return found
 
-    @torch.no_grad()
     def learn(self, g: Any, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
         """All that an update does; None: torch must do it."""
         bound = self._takes(g, x)
@@ -80,9 +79,9 @@ class CompiledMixture:
         loops: Any = load_loops()
         x, y = x.contiguous(), y.contiguous()
         of_all, said = np.empty((4, len(bound.all))), np.empty((2, y.numel()))
-        places = np.array([plan.places(one) for plan, one in pairs])
+        numbers = np.array([one.n_samples for one in self._learners])
         alarm = loops.update_mixture(
-            bound.row, self._members, places, on_array(bound, mask), x.data_ptr(), y.data_ptr(), said, of_all
+            bound.row, self._members, numbers, on_array(bound, mask), x.data_ptr(), y.data_ptr(), said, of_all
         )
         if alarm < 0:  # not finite
             return None

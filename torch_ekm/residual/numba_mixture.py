@@ -42,12 +42,12 @@ def _of_all(g, figures, events, of_all):
                 of_all[2, b] += mass[k] * figures[i, 2, b] / m
 
 
-@njit(INT(I1, I2, I2, ON, INT, INT, A2, A2), **COMMON)
-def update_mixture(g, members, places, on, x, y, said, of_all):
+@njit(INT(I1, I2, I1, ON, INT, INT, A2, A2), **COMMON)
+def update_mixture(g, members, numbers, on, x, y, said, of_all):
     """One sample per model where ``on``: all learners predict, the mixture judges them, they learn.
 
     Args:
-        places: where each learner's notes go, see its plan.
+        numbers: of samples that each learner has seen.
         x, y: addresses.
         said: room for mean and typical deviation of y, ``(2, models out)``.
         of_all: room for nis, novelty, weight and event of the mixture, ``(4, models)``.
@@ -124,7 +124,7 @@ def update_mixture(g, members, places, on, x, y, said, of_all):
                 for r in range(4):
                     figures[i, r, b] = found[r]
             at += n + W + 2 * M + 1
-        if gp.note(a, places[i], on_, x, learned, figures[i], errors[i]):
+        if gp.note(a, numbers[i], on_, x, learned, figures[i], errors[i]):
             alarm |= 1 << i
     _of_all(g, figures, events, of_all)
     return alarm

@@ -2,19 +2,19 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch.distributions import Normal
 
-from ..._checks import check_sizes
-from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..base import ResidualLearner
+from ..derivatives import value_and_jacobian
 from ..misled import Misled
+from ..recent import Recent
 from ..report import UpdateReport
-from ..running_scale import BLOCK, RunningScale, Units
+from ..running_scale import BLOCK
+from ..sparse_gp.units import Standardize
 
 _FAR = 2.3  # logarithm of a change of units after which a learner starts again
 _CUT = 6.0  # largest target in its own units
@@ -32,45 +32,24 @@ class ScaledLearner(ResidualLearner):
     A subclass implements f: ``_mean``, ``_law``, ``_slopes``, ``_learn``, ``_clear`` and ``_follow``.
 
     Args:
-        standardize: whether it learns units; else x and y are taken as they are.
-        output_offset: ``"zero"``, or ``"learned"``: y is centred too.
-        input_resolution, output_scale: sizes below which x and y mean nothing, see Standardize.
+        standardize: whether it learns units, or how; else x and y are taken as they are.
         options: see ResidualLearner.
     """
 
     settled = 0.1  #: relative change of units that is not worth adopting
+    grows = False  #: whether f grows with x without end
 
     def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        standardize: bool = True,
-        output_offset: Literal["zero", "learned"] = "zero",
-        input_resolution: float | Sequence[float] = 0.0,
-        output_scale: float | Sequence[float] = 0.0,
-        **options: Any,
+        self, in_features: int, out_features: int, *, standardize: bool | Standardize = True, **options: Any
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        if output_offset not in ("zero", "learned"):
-            raise ParameterError("output_offset", output_offset, "'zero' or 'learned'")
-        self.standardize, self.output_offset = bool(standardize), output_offset
-        self._least = (
-            check_sizes("input_resolution", input_resolution, in_features),
-            check_sizes("output_scale", output_scale, out_features),
-        )
+        self.standardize, self.n_samples = bool(standardize), 0
+        fleet = {"batch_shape": self.batch_shape, "dtype": self.dtype, "device": self.device}
+        units = standardize if isinstance(standardize, Standardize) else Standardize()
+        columns = [True] * self.in_features, [self.grows and self.standardize] * self.in_features
+        self.units = units.units(self.in_features, self.out_features, *columns, **fleet)
+        self.recent = Recent(self.in_features, self.out_features, BLOCK, **fleet)
         self.misled = Misled(tuple(self.batch_shape), self._kept, self.device)
-        self.n_samples = 0
-
-    def _make_units(self, shifted: list[bool], dtype: torch.dtype, grows: list[bool] | None = None) -> None:
-        """Last in a constructor."""
-        options = {"batch_shape": self.batch_shape, "dtype": dtype, "device": self.device}
-        centred = [self.output_offset == "learned"] * self.out_features
-        (resolution, least), grows = self._least, grows if self.standardize else None
-        self.units = Units(
-            RunningScale(self.in_features, shifted, grows, resolution, **options),
-            RunningScale(self.out_features, centred, least=least, **options),
-        )
 
     # -- f, in its own units --------------------------------------------------------------------
 
@@ -83,8 +62,9 @@ class ScaledLearner(ResidualLearner):
         """Mean and variance of f(z), or of t."""
 
     def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """f(z) and df/dz; autograd here."""
-        raise NotImplementedError
+        """f(z) and df/dz ``(*any, out, in)``; autograd here."""
+        mean, slope = value_and_jacobian(self._mean, z)
+        return mean, z.new_zeros(*mean.shape, z.shape[-1]) if slope is None else slope
 
     def _slope_variance(self, z: Tensor) -> Tensor:
         """Of each column of df/dz, ``(*any, in)``; NaN: not stated."""
@@ -114,8 +94,6 @@ class ScaledLearner(ResidualLearner):
         return Normal(self._value(mean), deviation.to(self.dtype), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        if type(self)._slopes is ScaledLearner._slopes:
-            return super().linearize(x)
         z = self._inputs(self.check_query(x))
         mean, slope = self._slopes(z)
         mean, slope = self.units.value(mean, 1), self.units.slope(slope, 1, z)
@@ -136,6 +114,7 @@ class ScaledLearner(ResidualLearner):
         self.misled.level.zero_()
         self._clear()
         self.units.reset()
+        self.recent.reset()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if self.standardize:
@@ -147,18 +126,20 @@ class ScaledLearner(ResidualLearner):
         if misled is not None:
             self._clear(misled)
             self.units.output.forget(misled)
+            self.recent.on.masked_fill_(misled.unsqueeze(-1), 0.0)
         return self._learn(z, self._targets(y), mask)
 
     def _observe(self, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         n, on = self.n_samples, None if mask is None else mask.to(x.dtype)
-        units = self.units
-        units.observe(n % BLOCK, x, y, on)
+        units, recent = self.units, self.recent
+        recent.keep(n, x, y, on)
         if n + 1 < BLOCK and n & (n + 1) == 0:
-            units.input.settle(young=True)
-            units.output.settle(young=True)
+            x, y, on, _ = recent.last(n + 1, n + 1)
+            units.input.settle(x, on)
+            units.output.settle(y, on)
             self._learn_block(n)
         elif (n + 1) % BLOCK == 0:
-            units.pool()
+            units.pool(recent.x, recent.y, recent.on)
             changes = units.input.settle(settled=self.settled), units.output.settle(settled=self.settled)
             ratios = torch.cat([changes[0][1], changes[1][1]], dim=-1).log().abs()
             if bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
@@ -170,13 +151,12 @@ class ScaledLearner(ResidualLearner):
     def _learn_block(self, n: int, models: Bool[Tensor, "*batch"] | None = None) -> None:
         """Again, from the first n samples of the present block only; all models, or these."""
         self._clear(models)
-        input, output = self.units.input, self.units.output
         for i in range(n):
-            on = input.block_on[..., i, 0] * output.block_on[..., i, 0] > 0
+            on = self.recent.on[..., i] > 0
             on = on if models is None else on & models
             if not bool(on.any()):  # nothing, or of a time that is forgotten
                 continue
-            x, y = input.block[..., i, :], output.block[..., i, :]
+            x, y = self.recent.x[..., i, :], self.recent.y[..., i, :]
             self._learn(self._inputs(x), self._targets(y), on if self.batch_shape else None)
 
     def _inputs(self, x: Float[Tensor, "*any in"]) -> Tensor:

@@ -13,8 +13,9 @@ from torch import nn
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
+from ..base import ResidualLearner
 from ..kernels.kernel import Kernel
-from ..kinds import DoubleStateLearner
+from ..recent import Recent
 from ..report import UpdateReport
 from ..running_scale import Units
 from .posterior import SparsePosterior
@@ -31,13 +32,17 @@ class Sample(NamedTuple):
     variance: Float[Tensor, "*batch"]
 
 
-class Host(DoubleStateLearner):
-    """What a part finds in its learner: the state, and how it is forgotten and learned again."""
+class Host(ResidualLearner):
+    """What a part finds in its learner: the state, and how it is forgotten and learned again.
+
+    The state is always float64: a change of dtype is one of the interface only.
+    """
 
     kernel: Kernel
     log_noise_variance: Tensor
     posterior: SparsePosterior
     units: Units
+    recent: Recent
     refresh_every: int
     refresh_offset: int
     n_samples: int
@@ -46,6 +51,19 @@ class Host(DoubleStateLearner):
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
     weighing: tuple[Part, ...]
     """Parts that weigh samples."""
+
+    def _apply(self, fn, recurse=True):
+        def keep_double(tensor):
+            moved = fn(tensor)
+            if tensor is self._like or not tensor.is_floating_point():
+                return moved
+            return tensor.to(moved.device)
+
+        return super()._apply(keep_double, recurse)
+
+    @property
+    def _kept(self) -> torch.dtype:
+        return torch.float64
 
     @property
     @abstractmethod
@@ -112,6 +130,7 @@ class Host(DoubleStateLearner):
     ) -> None:
         """These models forget all but units, kernel and noise, and learn the samples ``used``."""
         self.posterior.forget(models)
+        self.recent.forget(models)
         for part in self._parts:
             part.forget(models)
         self.pending.masked_fill_(models, 0.0)

@@ -17,15 +17,9 @@ from __future__ import annotations
     LOG_LENGTHSCALE, LOG_VARIANCE, LOG_ACTION, SHIFT, SCALE, SHIFT_Y, SCALE_Y, REACH,
     EMBEDDED,  # the basis as the kernel sees it
     LAYERS, WIDTHS, WEIGHTS,  # of a deep kernel's network
-    BLOCK_X, BLOCK_ON, BLOCK_Y, BLOCK_ON_Y,  # Standardize
+    RECENT_X, RECENT_Y, RECENT_ON, RECENT, RECENT_SIZE,  # of the last samples, with weights
     DISTRUSTED,  # RobustWeight
     FACTOR,  # CalibrateNoise
-    CHANGED, RING_X, RING_Y, RING, MISLED,  # DetectChanges
-    WINDOW_X, WINDOW_Y, WINDOW, WINDOW_SIZE,  # LearnHyperparameters
-    PAST_X, PAST_Y, PAST, PAST_ABSORBED, PAST_SIZE,  # its memory
+    CHANGED, LEVELS, MISLED,  # DetectChanges
     FIELDS,
-) = range(52)  # fmt: skip
-
-#: of an update: number of the sample (-1: no notes are taken), and places of its notes, -1: none
-(NUMBER, BLOCK_PLACE, WINDOW_PLACE) = range(3)
-NO_NOTES = (-1, -1, -1)
+) = range(42)  # fmt: skip

@@ -13,8 +13,9 @@ from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import Matern32
 from ..predictions import joint_draws
 from ..printed import sparse_gp
+from ..recent import Recent
 from ..report import MomentsWithJacobians, UpdateReport
-from ..running_scale import RunningScale, Units
+from ..running_scale import BLOCK, RunningScale, Units
 from .defaults import chosen_parts
 from .engine.compiled import CompiledEngine
 from .engine.recursion import absorb
@@ -57,9 +58,7 @@ class SparseOnlineGP(Host):
         novelty_threshold: smallest ``gamma / k**`` of a new basis vector.
         parts: what it does apart from projecting samples; copied.
         standardize: whether it follows the stream's units, unless a part does; or how.
-        refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
-            part that does, and on the CPU, one looks whether they have drifted (four times as often where
-            they do); they are rebuilt when they have, and at the latest after eight times as many.
+        refresh_every: samples after which parts may change the state, and the caches are rebuilt.
         refresh_offset: samples by which this comes later, for learners that are not to do it at the same one.
         options: see ResidualLearner.
 
@@ -106,15 +105,12 @@ class SparseOnlineGP(Host):
         self.engine: CompiledEngine | None = CompiledEngine()
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self.units = Units(*(RunningScale(size, **fleet) for size in sizes[:2]))
-        self._parts = ()
+        self.recent, self._parts = Recent(*sizes[:2], BLOCK, **fleet, dtype=torch.float64), ()
         for part in chosen_parts(parts, standardize):
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
-        self.weighing = _overriding(self._parts, "weigh")
-        self._noting = _overriding(self._parts, "after_update")
-        self._acting = _overriding(self._parts, "act")
-        self._preparing = _overriding(self._parts, "before_update")
+        self.weighing = tuple(part for part in self._parts if type(part).weigh is not Part.weigh)
 
     # -- predictions ----------------------------------------------------------------------------
 
@@ -240,34 +236,28 @@ class SparseOnlineGP(Host):
         """Forget all samples and units; kernel and noise stay."""
         self.posterior.reset()
         self.units.reset()
+        self.recent.reset()
         for part in self._parts:
             part.reset()
         for count in (self.pending, self.n_refused, self.largest):
             count.zero_()
         self.n_samples = 0
 
-    def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
-        """See :meth:`ResidualLearner.update`; single samples that compiled loops take skip its checks."""
-        if mask is None and self.engine is not None:
-            with self.lock:
-                report = self.engine.learn(self, x, y, None)
-                if report is not None:
-                    return report
-        return super().update(x, y, mask)
+    def at_once(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        return None if self.engine is None else self.engine.learn(self, x, y, mask)
 
     @torch.no_grad()
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        report = None if self.engine is None else self.engine.learn(self, x, y, mask)
-        if report is not None:
-            return report
         on = None if mask is None else mask.to(x.dtype)
-        for part in self._preparing:
+        self.recent.keep(self.n_samples, x, y, on)
+        for part in self._parts:
             part.before_update(self, x, y, on)
         sample, anew = Sample(x, y, on, *self.project(x, y, on)), False
-        for part in self._noting:
+        self.recent.weigh(self.n_samples, sample.report.weight)
+        for part in self._parts:
             anew |= part.after_update(self, sample)
         self.pending.add_(1.0 if on is None else on)  # += would register the buffer again
-        for part in self._acting:
+        for part in self._parts:
             part.act(self)
         self.count_sample(anew=anew)
         return sample.report
@@ -293,8 +283,3 @@ class SparseOnlineGP(Host):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self.n_samples = int(state["n_samples"])
-
-
-def _overriding(parts: Iterable[Part], *names: str) -> tuple[Part, ...]:
-    """Those of the parts that do something of their own in one of these methods."""
-    return tuple(p for p in parts if any(getattr(type(p), name) is not getattr(Part, name) for name in names))

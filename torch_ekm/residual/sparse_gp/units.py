@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -50,21 +50,21 @@ class Standardize(Part):
 
     def bind(self, learner: Host) -> None:
         """The learner's units are those that were asked for."""
-        sizes, fleet = (learner.in_features, learner.out_features), {"device": learner.device}
-        fleet = {"batch_shape": learner.posterior.batch_shape, **fleet}
-        shifted, grows = (of(sizes[0]) for of in (learner.kernel.shift_invariant, learner.kernel.grows))
-        centred = [self.output_offset == "learned"] * sizes[1]
-        resolution = check_sizes("input_resolution", self.input_resolution, sizes[0])
-        least = check_sizes("output_scale", self.output_scale, sizes[1])
-        learner.units = Units(
-            RunningScale(sizes[0], shifted, grows, resolution, **fleet),
-            RunningScale(sizes[1], centred, least=least, **fleet),
-        )
+        d, m, like = learner.in_features, learner.out_features, learner.posterior.basis
+        fleet = {"batch_shape": learner.batch_shape, "dtype": like.dtype, "device": like.device}
+        learner.units = self.units(d, m, learner.kernel.shift_invariant(d), learner.kernel.grows(d), **fleet)
 
-    def place(self, learner: Host) -> int:
-        """Of the present sample in the block, which is full just before a rebuild."""
-        n = learner.n_samples
-        return n if n < BLOCK else (n - learner.refresh_offset) % BLOCK
+    def units(
+        self, in_features: int, out_features: int, shifted: list[bool], grows: list[bool], **options: Any
+    ) -> Units:
+        """0 and 1 at first; of columns of x that are centred, and that are cut, see RunningScale."""
+        centred = [self.output_offset == "learned"] * out_features
+        resolution = check_sizes("input_resolution", self.input_resolution, in_features)
+        least = check_sizes("output_scale", self.output_scale, out_features)
+        return Units(
+            RunningScale(in_features, shifted, grows, resolution, **options),
+            RunningScale(out_features, centred, least=least, **options),
+        )
 
     def is_rough(self, learner: Host) -> bool:
         """Whether units are adopted before the present sample is learned."""
@@ -72,15 +72,14 @@ class Standardize(Part):
         return n & (n + 1) == 0 and n < _DOUBLING
 
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
-        """Take the sample in; while units are rough, adopt them before it is learned."""
-        n, units = learner.n_samples, learner.units
-        units.observe(self.place(learner), x, y, mask)
+        """While units are rough, adopt them before a sample is learned, which counts."""
+        n = learner.n_samples
         if not self.is_rough(learner):
             return
         if n + 1 < BLOCK:
-            self._adopt(learner, young=True)
-            x, y, on = units.input.block, units.output.block, units.input.block_on
-            learner.learn_anew(x[..., :n, :], y[..., :n, :], on[..., :n, 0])
+            x, y, on, _ = learner.recent.last(n + 1, n + 1)
+            self._adopt(learner, x, y, on)
+            learner.learn_anew(x[..., :n, :], y[..., :n, :], on[..., :n])
             return
         self._pool(learner)
         if not learner.is_due(n + 1):  # else it comes of itself
@@ -97,16 +96,16 @@ class Standardize(Part):
             self._adopt(learner)
 
     def _pool(self, learner: Host) -> None:
-        units = learner.units
-        if self.place(learner) == BLOCK - 1:
-            units.pool()
-            units.input.block_on.zero_()
-            units.output.block_on.zero_()
+        """Blocks end with the 32nd sample, and just before each rebuild from then on."""
+        n, offset = learner.n_samples + 1, learner.refresh_offset % BLOCK
+        if n == BLOCK or (n > BLOCK and (n - offset) % BLOCK == 0):
+            size = offset if offset and n == BLOCK + offset else BLOCK
+            learner.units.pool(*learner.recent.last(n, size)[:3])
 
-    def _adopt(self, learner: Host, young: bool = False) -> None:
+    def _adopt(self, learner: Host, *young: Tensor) -> None:
         posterior, units = learner.posterior, learner.units
-        offset, ratio = units.input.settle(young=young)
-        offset_t, ratio_t = units.output.settle(young=young)
+        offset, ratio = units.input.settle(*young[::2])
+        offset_t, ratio_t = units.output.settle(*young[1:])
         alien = (torch.cat([ratio, ratio_t], dim=-1) > 1.0 / ALIEN).any(-1)
         if alien.is_cuda or bool(alien.any()):  # what is of another size would stay for good
             posterior.forget(alien)

@@ -78,8 +78,8 @@ class Plan(Bound):
 
     def __init__(self, gp: Host) -> None:
         super().__init__()
-        self.kernel, self.units = gp.kernel, gp.part(Standardize)
-        self.changes, self.learning = gp.part(DetectChanges), gp.part(LearnHyperparameters)
+        self.units, self.changes = gp.part(Standardize), gp.part(DetectChanges)
+        self.learning = gp.part(LearnHyperparameters)
         self.shape = tuple(gp.batch_shape)
         self.one, self.two = (*self.shape, gp.out_features), (*self.shape, gp.out_features, gp.in_features)
         self.all = np.ones(math.prod(self.shape), np.bool_)
@@ -106,7 +106,7 @@ class Plan(Bound):
         self._basis, self._marks = gp.posterior.basis, [-1]
 
     def _fields(self, gp: Host) -> dict[int, Any]:
-        posterior, x, y = gp.posterior, gp.units.input, gp.units.output
+        posterior, recent, x, y = gp.posterior, gp.recent, gp.units.input, gp.units.output
         robust, calibrated = gp.part(RobustWeight), gp.part(CalibrateNoise)
         threshold = 0.0 if robust is None else robust.threshold**2
         fields: dict[int, Any] = {
@@ -117,38 +117,22 @@ class Plan(Bound):
             P.SLOT: posterior.slot, P.MOMENTS: posterior.moments, P.VECTORS: posterior.vectors,
             P.PENDING: gp.pending, P.LARGEST: gp.largest, P.LOG_NOISE: gp.log_noise_variance,
             P.SHIFT: x.shift, P.SCALE: x.scale, P.SHIFT_Y: y.shift, P.SCALE_Y: y.scale, P.REACH: x.reach,
-            P.BLOCK_X: x.block, P.BLOCK_ON: x.block_on, P.BLOCK_Y: y.block, P.BLOCK_ON_Y: y.block_on,
+            P.RECENT_X: recent.x, P.RECENT_Y: recent.y, P.RECENT_ON: recent.on, P.RECENT: recent.weight,
+            P.RECENT_SIZE: recent.capacity,
             **(_known(gp.kernel) or {}),
         }  # fmt: skip
         if robust is not None:
             fields[P.DISTRUSTED] = robust.level
         if calibrated is not None:
             fields[P.FACTOR] = calibrated.log_factor
-        if (part := self.changes) is not None:
-            fields |= {
-                P.CHANGED: part.level, P.RING_X: part.inputs, P.RING_Y: part.targets, P.RING: part.levels,
-                P.MISLED: part.misled.level,
-            }  # fmt: skip
-        if (part := self.learning) is not None:
-            fields |= {
-                P.WINDOW_X: part.window_x, P.WINDOW_Y: part.window_y, P.WINDOW: part.window_on,
-                P.WINDOW_SIZE: part.window,
-            }  # fmt: skip
-            if (past := part.past) is not None:
-                fields |= {
-                    P.PAST_X: past.x, P.PAST_Y: past.y, P.PAST: past.weight, P.PAST_ABSORBED: past.absorbed,
-                    P.PAST_SIZE: past.capacity,
-                }  # fmt: skip
+        if self.changes is not None:
+            level, misled = self.changes.level, self.changes.misled.level
+            fields |= {P.CHANGED: level, P.LEVELS: self.changes.levels, P.MISLED: misled}
         return fields
 
     def is_rough(self, gp: Host) -> bool:
         """Whether a part changes the state before the present sample is learned."""
         return self.units is not None and self.units.is_rough(gp)
-
-    def places(self, gp: Host) -> tuple[int, ...]:
-        """Where loops take notes of the present sample for the parts."""
-        block = -1 if self.units is None else self.units.place(gp)
-        return gp.n_samples, block, -1 if self.learning is None else self.learning.place(gp)
 
     def act(self, gp: Host, alarm: bool) -> None:
         """What is due after the notes of a sample."""

@@ -13,7 +13,6 @@ from ...._warnings import warn
 from ....exceptions import SpeedWarning
 from ....typing import Tensor
 from ...report import MomentsWithJacobians, UpdateReport
-from .. import plan as P
 from ..part import Host
 from .binding import Bound, Plan
 from .loading import load_loops
@@ -56,13 +55,12 @@ class CompiledEngine:
         loops.query_fleet(plan.row, noisy, *addresses)
         return MomentsWithJacobians(mean, v, J, dv)
 
-    @torch.no_grad()
     def learn(self, gp: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
         """All that an update does; None: not one good sample for each model, or torch must do it."""
         plan = self.plan(gp, x)
         if plan is None or not is_plain_one(y, plan.one) or plan.is_rough(gp):
             return None
-        (report, *_), alarm = self._update(plan, plan.places(gp), x, y, mask)
+        (report, *_), alarm = self._update(plan, gp.n_samples, x, y, mask)
         if alarm < 0:
             return None
         plan.act(gp, bool(alarm))
@@ -75,11 +73,11 @@ class CompiledEngine:
         plan = self.plan(gp, x)
         if plan is None or not is_plain_one(y, plan.one):
             return None
-        done, alarm = self._update(plan, P.NO_NOTES, x, y, None if on is None else on > 0)
+        done, alarm = self._update(plan, -1, x, y, None if on is None else on > 0)
         return done if alarm >= 0 else None
 
     def _update(
-        self, plan: Plan, places: tuple[int, ...], x: Tensor, y: Tensor, mask: Tensor | None
+        self, plan: Plan, n: int, x: Tensor, y: Tensor, mask: Tensor | None
     ) -> tuple[tuple[UpdateReport, Tensor, Tensor], int]:
         x, y = x.contiguous(), y.contiguous()
         figures, event = np.zeros((4, len(plan.all))), np.zeros(len(plan.all), np.int64)
@@ -88,9 +86,8 @@ class CompiledEngine:
         errors = np.zeros((len(plan.all), plan.one[-1]))
         loops: Any = load_loops()
         alarm = loops.update_fleet(
-            plan.row, np.array(places), on_array(plan, mask), x.data_ptr(), y.data_ptr(), figures, event,
-            errors,
-        )  # fmt: skip
+            plan.row, n, on_array(plan, mask), x.data_ptr(), y.data_ptr(), figures, event, errors
+        )
         novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *plan.shape)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(plan.shape)), novelty, nis, weight)
         return (report, torch.from_numpy(errors.reshape(plan.one)), variance), alarm

@@ -12,7 +12,6 @@ from numba import njit, types
 
 from ...base import FARTHEST
 from ...misled import MISLED_RATE, WORSE
-from ...running_scale import BLOCK
 from .. import plan as P
 from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, RING_SIZE, Z90_SQUARED
 from .numba_kernels import absorb, kernel_row, kernel_slopes, times
@@ -245,41 +244,39 @@ def grow_largest(p, on, y):
                 largest[o] = max(largest[o], abs(y_[o]))
 
 
-@njit(types.boolean(I1, I1, ON, INT, INT, A2, A2), **INNER)
-def changed(p, turn, on, x, y, figures, errors):
-    """What DetectChanges notes of a sample per model; whether a model faces another system."""
-    B, d, m, alarm = p[P.MODELS], p[P.IN], p[P.OUT], False
-    for b in range(B):
+@njit(types.boolean(I1, INT, ON, INT, A2, A2), **INNER)
+def changed(p, n, on, y, figures, errors):
+    """What DetectChanges notes of the sample after n per model; whether a model faces another system."""
+    m, alarm = p[P.OUT], False
+    for b in range(p[P.MODELS]):
         level, misled = vector_at(p[P.CHANGED], b, 1), vector_at(p[P.MISLED], b, 1)
-        at = turn[P.NUMBER] % RING_SIZE * B + b
-        ring_x, ring_y = vector_at(p[P.RING_X], at, d), vector_at(p[P.RING_Y], at, m)
-        x_, y_ = vector_at(x, b, d), vector_at(y, b, m)
-        for j in range(d):
-            ring_x[j] = x_[j]
-        for o in range(m):
-            ring_y[o] = y_[o]
         if on[b]:
-            wrong, size = 0.0, 0.0
+            y_, wrong, size = vector_at(y, b, m), 0.0, 0.0
             shift, scale = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m)
             for o in range(m):
                 t = (y_[o] - shift[o]) / scale[o]
                 wrong, size = wrong + errors[b, o] * errors[b, o], size + t * t
             level[0] += RATE * ((1.0 if figures[1, b] > LARGE else 0.0) - level[0])
             misled[0] += MISLED_RATE * ((1.0 if wrong > WORSE * size else 0.0) - misled[0])
-        vector_at(p[P.RING], at, 1)[0] = level[0] if on[b] else np.inf
+        vector_at(p[P.LEVELS], n % RING_SIZE * p[P.MODELS] + b, 1)[0] = level[0] if on[b] else np.inf
         alarm |= level[0] > ALARM or misled[0] > ALARM
     return alarm
 
 
-@njit(types.void(I1, I1, ON, INT, INT, A2, A2), **INNER)
-def keep(p, turn, on, x, y, figures, errors):
-    """What the other parts note of a sample per model, and the learner itself."""
-    B, d, m = p[P.MODELS], p[P.IN], p[P.OUT]
-    window, size = turn[P.WINDOW_PLACE], p[P.PAST_SIZE]
-    for b in range(B):
-        x_, y_, one = vector_at(x, b, d), vector_at(y, b, m), 1.0 if on[b] else 0.0
+@njit(types.boolean(I1, INT, ON, INT, INT, A2, A2), **INNER)
+def note(p, n, on, x, y, figures, errors):
+    """All notes of the sample after n (-1: none) per model; whether a model faces another system."""
+    if n < 0:
+        return False
+    d, m = p[P.IN], p[P.OUT]
+    grow_largest(p, on, y)
+    for b in range(p[P.MODELS]):
+        one, at = 1.0 if on[b] else 0.0, b * p[P.RECENT_SIZE] + n % p[P.RECENT_SIZE]
+        write(p[P.RECENT_X], at, vector_at(x, b, d))
+        write(p[P.RECENT_Y], at, vector_at(y, b, m))
+        vector_at(p[P.RECENT_ON], at, 1)[0] = one
+        vector_at(p[P.RECENT], at, 1)[0] = figures[2, b] * one
         vector_at(p[P.PENDING], b, 1)[0] += one
-        weight = figures[2, b] * one
         if p[P.FACTOR] and on[b]:
             factor, log_noise = vector_at(p[P.FACTOR], b, m), vector_at(p[P.LOG_NOISE], b, m)
             for o in range(m):
@@ -287,34 +284,7 @@ def keep(p, turn, on, x, y, figures, errors):
                 missed = 1.0 if errors[b, o] * errors[b, o] > Z90_SQUARED * variance else 0.0
                 moved = factor[o] + CALIBRATION_RATE * (missed - 0.1)
                 factor[o] = min(max(moved, FACTOR_LEAST), FACTOR_MOST)
-        if window >= 0:
-            at = b * p[P.WINDOW_SIZE] + window
-            write(p[P.WINDOW_X], at, x_)
-            write(p[P.WINDOW_Y], at, y_)
-            vector_at(p[P.WINDOW], at, 1)[0] = weight
-        if size > 0:
-            at = b * size + turn[P.NUMBER] % size
-            write(p[P.PAST_X], at, x_)
-            write(p[P.PAST_Y], at, y_)
-            vector_at(p[P.PAST], at, 1)[0] = weight
-    if size > 0:
-        vector_at(p[P.PAST_ABSORBED], turn[P.NUMBER] % size, 1)[0] = 0.0
-
-
-@njit(types.boolean(I1, I1, ON, INT, INT, A2, A2), **INNER)
-def note(p, turn, on, x, y, figures, errors):
-    """All notes of a sample, at the places ``turn``; whether a model faces another system."""
-    if turn[P.NUMBER] < 0:
-        return False
-    grow_largest(p, on, y)
-    if turn[P.BLOCK_PLACE] >= 0:
-        for b in range(p[P.MODELS]):
-            at, one = b * BLOCK + turn[P.BLOCK_PLACE], 1.0 if on[b] else 0.0
-            write(p[P.BLOCK_X], at, vector_at(x, b, p[P.IN]))
-            write(p[P.BLOCK_Y], at, vector_at(y, b, p[P.OUT]))
-            vector_at(p[P.BLOCK_ON], at, 1)[0] = vector_at(p[P.BLOCK_ON_Y], at, 1)[0] = one
-    keep(p, turn, on, x, y, figures, errors)
-    return p[P.CHANGED] != 0 and changed(p, turn, on, x, y, figures, errors)
+    return p[P.CHANGED] != 0 and changed(p, n, on, y, figures, errors)
 
 
 @njit(types.boolean(I1, INT, INT), **INNER)
@@ -329,9 +299,9 @@ def are_finite(p, x, y):
     return math.isfinite(total)
 
 
-@njit(INT(I1, I1, ON, INT, INT, A2, I1, A2), **COMMON)
-def update_fleet(p, turn, on, x, y, figures, event, errors):
-    """One sample per model where ``on``, given by addresses.
+@njit(INT(I1, INT, ON, INT, INT, A2, I1, A2), **COMMON)
+def update_fleet(p, n, on, x, y, figures, event, errors):
+    """The sample after n (-1: without notes) per model where ``on``, given by addresses.
 
     Returns:
         1 where a model faces another system, else 0; -1: a sample is not finite, and nothing was done.
@@ -353,4 +323,4 @@ def update_fleet(p, turn, on, x, y, figures, event, errors):
         event[b] = learn(p, b, values, q, k, Ck, prior, vector_at(y, b, m), t, found, errors[b])
         for r in range(4):
             figures[r, b] = found[r]
-    return int(note(p, turn, on, x, y, figures, errors))
+    return int(note(p, n, on, x, y, figures, errors))
