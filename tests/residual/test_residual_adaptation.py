@@ -26,8 +26,8 @@ from torch_ekm.residual import (
     Standardize,
 )
 from torch_ekm.residual.kernels.kernel import Kernel
+from torch_ekm.residual.recent import Recent
 from torch_ekm.residual.sparse_gp.prequential_loss import Queries
-from torch_ekm.residual.sparse_gp.replay import ReplayMemory
 
 
 def system(seed: int, n: int, noise: float = 0.1) -> tuple[torch.Tensor, torch.Tensor]:
@@ -41,12 +41,6 @@ def learning_of(gp: SparseOnlineGP) -> LearnHyperparameters:
     part = gp.part(LearnHyperparameters)
     assert part is not None
     return part
-
-
-def past_of(gp: SparseOnlineGP) -> ReplayMemory:
-    past = learning_of(gp).past
-    assert past is not None
-    return past
 
 
 def loss_by_dense_algebra(gp: SparseOnlineGP, queries: Queries, robust: float | None) -> torch.Tensor:
@@ -119,7 +113,7 @@ def test_gradients_in_closed_form_are_those_of_autograd(kind, robust, fleet, fad
     y = torch.sin(2 * x[..., :2]) + 0.1 * torch.randn(x[..., :2].shape, generator=generator).double()
     gp.update(x, y)  # the last window is full but for one sample, so not used up
     learning = learning_of(gp)
-    queries = learning.queries(gp)
+    queries = learning.queries(gp, gp.n_samples)
     assert queries.x.shape[-2] > 16
     parameters = [*gp.kernel.buffers(), gp.log_noise_variance]
     found = learning.loss.with_gradients(gp.kernel, gp.log_noise_variance, queries)
@@ -143,7 +137,8 @@ def test_lagged_loss_is_the_density_of_the_old_state():
     expected = -law.log_prob(y[48:63]).mean(-1).mean()
     gp.update(x[48:63], y[48:63])
     learning = learning_of(gp)
-    loss, _ = learning.loss.with_gradients(gp.kernel, gp.log_noise_variance, learning.queries(gp))
+    queries = learning.queries(gp, gp.n_samples)
+    loss, _ = learning.loss.with_gradients(gp.kernel, gp.log_noise_variance, queries)
     assert float(loss) == pytest.approx(float(expected), abs=1e-6)
 
 
@@ -176,55 +171,51 @@ def test_a_replayed_sample_is_predicted_by_the_exact_gp_of_all_others():
         assert float(seen) < float(loss) - 1e-3  # what was seen flatters itself
 
 
-def filled_memory(n: int, capacity: int, horizon: float = math.inf) -> ReplayMemory:
-    posterior = sogp(1, 1, capacity=2).posterior
-    memory = ReplayMemory(posterior, capacity, horizon)
+def filled(n: int, capacity: int) -> Recent:
+    recent = Recent(1, 1, capacity, batch_shape=(), dtype=torch.float64)
     for i in range(n):
         value = torch.tensor([float(i)], dtype=torch.float64)
-        memory.offer(value, -value, torch.ones((), dtype=torch.float64))
-    memory.settle()
-    return memory
+        recent.keep(i, value, -value, None)
+        recent.weigh(i, torch.tensor(0.5, dtype=torch.float64))
+    return recent
 
 
-def test_memory_is_an_even_sample_of_the_past():
-    memory = filled_memory(20_000, 500)
-    kept = memory.x[:, 0]
-    assert len(kept.unique()) == 500
-    torch.testing.assert_close(memory.y[:, 0], -kept)
-    share = torch.histc(kept, bins=10, min=0, max=20_000) / 500
-    # a tenth each, standard deviation .013
-    assert float((share - 0.1).abs().max()) < 0.04
+def test_the_last_samples_are_kept_in_their_order_with_their_age():
+    recent = filled(1_234, 500)
+    x, y, on, weight = recent.last(1_234, 40)
+    assert x[:, 0].tolist() == list(range(1_194, 1_234))
+    assert torch.equal(y, -x)
+    assert bool((on == 1.0).all() & (weight == 0.5).all())
+    x, y, weight, age = recent.take(1_234, 500)
+    assert sorted(x[:, 0].tolist()) == list(range(734, 1_234))
+    assert torch.equal(age, 1_234 - x[:, 0])
+    recent.forget(torch.tensor(True))
+    assert float(recent.take(1_234, 500)[2].sum()) == 0
+    assert float(recent.last(1_234, 40)[2].sum()) == 40
 
 
-def test_memory_of_a_learner_that_forgets_fades_as_it_does():
-    memory = filled_memory(20_000, 2_000, horizon=300.0)
-    age = 19_999 - memory.x[:, 0]
-    assert memory.capacity == 300
-    # exponential: mean 300, a share exp(-1) is older than that
-    assert 240 < float(age.mean()) < 360
-    assert 0.28 < float((age > 300).double().mean()) < 0.46
-    longer = filled_memory(20_000, 200, horizon=1000.0)
-    assert 750 < float((19_999 - longer.x[:, 0]).mean()) < 1250
-
-
-def test_turns_go_through_the_whole_memory():
-    memory = filled_memory(500, 500)
-    seen = torch.cat([memory.take(64)[0][:, 0] for _ in range(7)])
+def test_turns_go_through_all_that_is_kept():
+    recent = filled(500, 500)
+    seen = torch.cat([recent.take(500, 64)[0][:, 0] for _ in range(7)])
     assert len(seen) == len(seen.unique()) == 7 * 64
-    assert len(filled_memory(10, 500).take(64)[0]) == 10
-    assert len(filled_memory(0, 500).take(64)[0]) == 0
+    assert len(filled(10, 500).take(10, 64)[0]) == 10
+    assert len(filled(0, 500).take(0, 64)[0]) == 0
 
 
 def test_what_is_not_yet_part_of_the_state_is_not_taken_for_seen():
-    memory = filled_memory(100, 500)
-    memory.offer(torch.ones(1).double(), torch.ones(1).double(), torch.ones(()).double())
-    weight = memory.take(500)[2]
-    assert float(weight.sum()) == 100
-    assert float(weight[100]) == 0
-    memory.settle()
-    assert float(memory.take(500)[2].sum()) == 101
-    memory.forget(torch.tensor(True))
-    assert float(memory.take(500)[2].sum()) == 0
+    x, y = system(3, 100)
+    gp = sogp(4, 2, capacity=20, refresh_every=32, parts=[LearnHyperparameters(memory=500)])
+    gp.update(x, y)  # rebuilt after 96
+    queries = learning_of(gp).queries(gp, gp.n_samples)
+    absorbed, counts = queries.absorbed > 0, queries.weight > 0
+    assert int((counts & absorbed).sum()) == 96
+    assert int((counts & ~absorbed).sum()) == 4
+    assert not set(queries.x[counts & absorbed, 0].tolist()) & set(queries.x[~absorbed, 0].tolist())
+
+
+def test_a_learner_that_forgets_keeps_no_more_than_it_knows():
+    parts = [ForgettingFactor(0.99), LearnHyperparameters(memory=2000)]
+    assert sogp(4, 2, parts=parts).recent.capacity == 100
 
 
 def test_adaptation_beats_a_wrong_start():
@@ -335,7 +326,7 @@ def test_a_learner_with_a_memory_goes_on_after_a_reload_as_if_nothing_had_been()
         half.update(x[142:], y[142:])
         assert torch.equal(half(x), whole(x))
     whole.reset()
-    assert float(past_of(whole).weight.sum()) == 0
+    assert float(whole.recent.weight.sum()) == 0
 
 
 def test_after_a_change_the_memory_holds_the_new_system_only():
@@ -344,7 +335,7 @@ def test_after_a_change_the_memory_holds_the_new_system_only():
     parts = [RobustWeight(3.0), DetectChanges(), LearnHyperparameters(memory=200)]
     gp = sogp(4, 2, capacity=40, noise_variance=0.01, parts=parts)
     gp.update(x, y)
-    memory = past_of(gp)
+    memory = gp.recent
     kept = memory.x[memory.weight > 0]
     numbers = [int((x == row).all(-1).nonzero()) for row in kept]
     assert len(numbers) > 50
@@ -352,8 +343,8 @@ def test_after_a_change_the_memory_holds_the_new_system_only():
 
 
 def test_where_g_wanders_there_is_no_memory():
-    assert learning_of(deep_sogp(4, 2, parts=[ProcessNoise(0.003)])).past is None
-    assert learning_of(deep_sogp(4, 2)).past is not None
+    assert learning_of(deep_sogp(4, 2, parts=[ProcessNoise(0.003)])).memory == 0
+    assert learning_of(deep_sogp(4, 2)).memory == 2000
     with pytest.raises(ParameterError, match="another g"):
         sogp(4, 2, parts=[ProcessNoise(0.003), LearnHyperparameters(memory=100)])
 

@@ -152,7 +152,7 @@ def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
     mask = torch.rand(64, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
     fleet = sogp(3, 2, capacity=12, batch_shape=(2, 3), parts=[Standardize()])
     fleet.update(x, y, mask)
-    units = fleet.part(Standardize)
+    units = fleet.units
     assert units is not None
     units.input.settle(settled=0.0)
     units.output.settle(settled=0.0)

@@ -27,7 +27,6 @@ from torch_ekm.residual import (
     default_learner,
 )
 from torch_ekm.residual.kernels.kernel import Kernel
-from torch_ekm.residual.sparse_gp.engine.reference import ReferenceEngine
 
 EVERY = pytest.mark.parametrize("name", LEARNERS)
 POWERS = st.floats(-9.0, 9.0).map(lambda power: 10.0**power)
@@ -105,10 +104,7 @@ class Fails(ZeroResidual):
         return torch.distributions.Normal(law.mean, law.stddev + law.mean, validate_args=False)
 
 
-@pytest.mark.parametrize("reference", [False, True])
-def test_a_member_that_is_not_finite_has_no_say(reference, monkeypatch):
-    if reference:
-        monkeypatch.setattr("torch_ekm.residual.mixture_engine.load_loops", lambda: None)
+def test_a_member_that_is_not_finite_has_no_say():
     x, y = Hostile(5, 120, 1.0, 1.0, 0.0, 0.0, ()).samples()
     alone = MixtureResidual([SparseOnlineGP(4, 2)])
     both = MixtureResidual([SparseOnlineGP(4, 2), Fails(4, 2)])
@@ -167,7 +163,7 @@ def test_slope_deviations_of_linear_learners_are_those_of_differences(make):
         z = learner._inputs(torch.stack([point + step, point - step]))
         phi = learner.features(z)
         difference = (phi[0] - phi[1]) / (2 * h)
-        expected = (difference @ learner.covariance @ difference).sqrt() * learner.output.scale
+        expected = (difference @ learner.covariance @ difference).sqrt() * learner.units.output.scale
         torch.testing.assert_close(learner.slope_deviation(point)[:, j], expected, rtol=1e-4, atol=0.0)
 
 
@@ -206,7 +202,7 @@ def test_what_lies_below_the_resolution_is_no_input(make):
     x, y = Hostile(0, 120, 1.0, 1.0, 0.0, 0.0, ()).samples()
     x[:, 3] *= 1e-6
     known: dict = {"input_resolution": [0.0, 0.0, 0.0, 1e-2]}
-    made = make(4, 2, standardize=Standardize(**known)) if make is SparseOnlineGP else make(4, 2, **known)
+    made = make(4, 2, **known if make is default_learner else {"standardize": Standardize(**known)})
     made.update(x, y)
     still = x.clone()
     still[:, 3] = 0.0
@@ -220,8 +216,7 @@ def test_what_lies_below_the_resolution_is_no_input(make):
 def test_an_output_below_its_scale_is_noise_of_that_scale():
     x, y = Hostile(0, 60, 1.0, 1e-9, 0.0, 0.0, ()).samples()
     for make in (SparseOnlineGP, RecursiveLeastSquares):
-        known: dict = {"output_scale": 1e-3}
-        made = make(4, 2, standardize=Standardize(**known)) if make is SparseOnlineGP else make(4, 2, **known)
+        made = make(4, 2, standardize=Standardize(output_scale=1e-3))
         before = made.predict(x[0], observation=True).stddev
         torch.testing.assert_close(before, make(4, 2).predict(x[0], observation=True).stddev * 1e-3)
         made.update(x, y)
@@ -252,7 +247,7 @@ def test_bounds_are_part_of_the_state(name):
 def test_compiled_loops_cut_where_torch_does(kernel):
     x, y = Hostile(1, 60, 1.0, 1.0, 0.0, 1e-9, ("input stands still",)).samples()
     learners = [SparseOnlineGP(4, 2, kernel=copy.deepcopy(kernel), capacity=12) for _ in range(2)]
-    learners[1].engine = ReferenceEngine()
+    learners[1].engine = None
     cut = 0
     for x_t, y_t in zip(x, y, strict=True):
         for far in (x_t, 100.0 * x_t):
@@ -270,7 +265,7 @@ def test_a_point_without_effect_makes_no_basis_vector(engine):
     """Its variance is that of an action of 1e-17, whose inverse would multiply what comes."""
     gp = SparseOnlineGP(2, 1, kernel=ActionLinearKernel(2, 1), parts=(), standardize=False)
     if engine == "torch":
-        gp.engine = ReferenceEngine()
+        gp.engine = None
     one = torch.ones(1, dtype=torch.float64)
     gp.update(torch.tensor([0.3, 1e-17], dtype=torch.float64), one)
     gp.update(torch.tensor([0.2, 1.0], dtype=torch.float64), one)

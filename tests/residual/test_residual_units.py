@@ -118,8 +118,8 @@ def test_least_squares_in_single_precision_far_from_the_origin():
 def test_an_offset_of_the_outputs(kind):
     """Far from all samples the prediction is the mean of y, whose size does not matter."""
     x, y = stream(150)
-    own = {"standardize": Standardize(output_offset="learned")} if kind in ("sogp", "deep") else {}
-    learner = SMALL[kind](**own or {"output_offset": "learned"})
+    learned = {"output_offset": "learned"}
+    learner = SMALL[kind](**learned if kind == "default" else {"standardize": Standardize(**learned)})
     assert torch.equal(learner(x[:2]), torch.zeros(2, 2, dtype=torch.float64))
     learner.update(x, y + 300.0)
     assert float((learner(x) - y - 300.0).square().mean().sqrt()) < 0.45
@@ -133,8 +133,8 @@ def test_a_slow_change_of_scale_is_followed():
     x = stream(n)[0] * growth
     scale = RunningScale(3, [True] * 3)
     scale.memory = 300
-    for t in range(n):
-        scale.observe(t % BLOCK, x[t], None)
+    for block in x.split(BLOCK):
+        scale.pool(block, torch.ones(len(block)).double())
     scale.settle()
     torch.testing.assert_close(scale.scale, torch.full_like(scale.scale, 8.5), rtol=0.2, atol=0.0)
 
@@ -145,8 +145,8 @@ def test_what_rests_keeps_its_units():
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(4000, 1, generator=generator, dtype=torch.float64)
     x[1000:] *= 1e-6
-    for t in range(len(x)):
-        scale.observe(t % BLOCK, x[t], None)
+    for block in x.split(BLOCK):
+        scale.pool(block, torch.ones(len(block)).double())
     scale.settle()
     assert 0.3 < float(scale.scale) < 1.2
 
@@ -156,8 +156,7 @@ def test_new_units_change_no_prediction():
     x, y = stream(40)
     learner = SparseOnlineGP(3, 2, capacity=50, parts=[Standardize(output_offset="learned")])
     learner.update(x, y + 5.0)
-    units = learner.part(Standardize)
-    assert units is not None
+    units = learner.units
     precision = learner.posterior.precision.sum(-1, keepdim=True)
     old = learner.posterior.information * units.output.scale + precision * units.output.shift
     units.output.centre += 2.0
@@ -173,7 +172,7 @@ def test_units_are_told_and_kept():
     learner = SparseOnlineGP(3, 2)
     learner.update(x * 1e3, y)
     assert "scale=" in repr(learner)
-    assert math.isclose(float(learner.state_dict()["parts.0.input.scale"][0]), 1e3, rel_tol=0.3)
+    assert math.isclose(float(learner.state_dict()["units.input.scale"][0]), 1e3, rel_tol=0.3)
 
 
 def test_bursts_are_no_outliers():
@@ -186,8 +185,8 @@ def test_bursts_are_no_outliers():
     found = []
     for on in (burst, alone):
         scale = RunningScale(1)
-        for n, x in enumerate(torch.where(on, large, small)):
-            scale.observe(n % BLOCK, x, None)
+        for block in torch.where(on, large, small).split(BLOCK):
+            scale.pool(block, torch.ones(BLOCK).double())
         scale.settle()
         found.append(float(scale.scale))
     assert found[0] > 0.04
@@ -208,11 +207,11 @@ def test_arrays_are_pooled_as_tensors_are(fleet, monkeypatch):
             x[..., 3] = 7.0
         if block == 40:
             x[..., 1] *= 1e-30
-        for place in range(BLOCK):
-            for scale, plain in ((ours, running_scale.is_plain), (theirs, lambda *_: False)):
-                with monkeypatch.context() as patch:
-                    patch.setattr(running_scale, "is_plain", plain)
-                    scale.observe(place, x[place], None if block % 2 else on[place].double())
+        on, x = (on | bool(block % 2)).double().movedim(0, -1), x.movedim(0, -2)
+        for scale, plain in ((ours, running_scale.is_plain), (theirs, lambda *_: False)):
+            with monkeypatch.context() as patch:
+                patch.setattr(running_scale, "is_plain", plain)
+                scale.pool(x, on)
         for name in ("weight", "centre", "spread", "large"):
             torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-10, atol=1e-300)
         if block % 3 == 0:

@@ -82,13 +82,13 @@ def _build(learner: ResidualLearner, inputs: Inputs, variance: bool) -> _Express
 def _sparse(learner: SparseOnlineGP, inputs: Inputs, variance: bool) -> _Expression:
     """``mean = scale alpha'k + offset``, ``var = scale^2 (k** + k'Ck)``, in the learner's units and bound."""
     units, posterior = learner.units, learner.posterior
-    shift, wide, scale, offset = 0.0, 1.0, ca.SX.ones(learner.out_features), 0.0
-    if units.affine():
-        names = "shift", "input_scale", "output_shift", "output_scale"
-        shift, wide, offset, scale = (
-            inputs.take(name, lambda i=i: units.affine()[i]) for i, name in enumerate(names)
-        )
-    reach = None if units.input is None or not units.input.cuts else ca.DM(units.input.reach.tolist())
+    own = ("shift", units.input), ("input_scale", units.input), ("output_shift", units.output), (
+        "output_scale", units.output,
+    )  # fmt: skip
+    shift, wide, offset, scale = (
+        inputs.take(name, lambda name=name, one=one: one.get_buffer(name.split("_")[-1])) for name, one in own
+    )
+    reach = ca.DM(units.input.reach.tolist()) if units.input.cuts else None
     bounded = _bounded(learner, inputs)
     column, diagonal = covariance(learner.kernel, lambda: posterior.basis, inputs)
     alpha = inputs.take("alpha", lambda: posterior.alpha)

@@ -125,8 +125,12 @@ class ResidualLearner(Recorded, Predictions):
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
-        with self.lock, torch.inference_mode(False):  # some learn by autograd
-            return self._update(x, y, mask)
+        with self.lock:
+            report = self.at_once(x, y, None) if mask is None else None
+            if report is None:
+                with torch.inference_mode(False):  # some learn by autograd
+                    report = self._update(x, y, mask)
+            return report
 
     def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if self._like.is_inference():  # torch refuses to change these later on
@@ -155,7 +159,12 @@ class ResidualLearner(Recorded, Predictions):
             return UpdateReport.of_nothing(mask, self.dtype)
         size = y.abs() if mask is None else y.abs() * mask.unsqueeze(-1)
         torch.maximum(self.largest, size, out=self.largest)
-        return self.absorb(x, y, mask)
+        report = self.at_once(x, y, mask)
+        return self.absorb(x, y, mask) if report is None else report
+
+    def at_once(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        """All that an update does, checks included, by compiled loops; None: they do not take it."""
+        return None
 
     def bounded(self, mean: Float[Tensor, "*all out"]) -> Float[Tensor, "*all out"]:
         """A mean, cut at ``2 largest``: what is linear in x extrapolates to anything."""

@@ -1,34 +1,11 @@
-"""Kinds of learners: of a state in float64, and of one model."""
+"""Learners that are one model."""
 
 from __future__ import annotations
-
-import torch
 
 from ..exceptions import ParameterError
 from ..typing import Tensor
 from .base import ResidualLearner
 from .report import UpdateReport
-
-
-class DoubleStateLearner(ResidualLearner):
-    """A learner whose state is float64 for any dtype of its inputs and outputs.
-
-    Device moves take all along; a change of dtype is one of the interface only: float32 cannot hold the
-    inverse of a smooth kernel's matrix.
-    """
-
-    def _apply(self, fn, recurse=True):
-        def keep_double(tensor):
-            moved = fn(tensor)
-            if tensor is self._like or not tensor.is_floating_point():
-                return moved
-            return tensor.to(moved.device)
-
-        return super()._apply(keep_double, recurse)
-
-    @property
-    def _kept(self) -> torch.dtype:
-        return torch.float64
 
 
 class SingleLearner(ResidualLearner):

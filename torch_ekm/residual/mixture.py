@@ -12,19 +12,8 @@ from torch import nn
 
 from ..exceptions import ParameterError
 from ..typing import AnyArray, Tensor
+from . import experts as E
 from .base import ResidualLearner
-from .experts import (
-    FARTHEST,
-    FREEDOM,
-    LEAST,
-    LEVEL_DECAY,
-    RATE,
-    RMS_LEAST,
-    RMS_MOST,
-    SQUARE_MOST,
-    TREND_DECAY,
-    YOUNG,
-)
 from .local_noise import LocalNoise
 from .mixture_engine import CompiledMixture
 from .mixture_queries import MixtureQueries
@@ -174,20 +163,11 @@ class MixtureResidual(MixtureQueries):
             learner.new_sequence()
         self._settle()
 
-    def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
-        """See :meth:`ResidualLearner.update`; single samples that the engine accepts skip its checks."""
-        if mask is None:
-            with self.lock:
-                report = self._engine.learn(self, x, y, None)
-                if report is not None:
-                    return report
-        return super().update(x, y, mask)
+    def at_once(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        return self._engine.learn(self, x, y, mask)
 
     @torch.no_grad()
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        report = self._engine.learn(self, x, y, mask)
-        if report is not None:
-            return report
         moments = [learner.moments(x, observation=True) for learner in self.members]
         nis, *said = self._judged(x, y, mask, moments)
         reports = [learner.step(x, y, mask) for learner in self.members]
@@ -218,7 +198,7 @@ class MixtureResidual(MixtureQueries):
         for experts, most in ((best, 0.0), (~best, -_BEHIND)):
             if bool(experts.any()):
                 own = self.evidence[..., experts]
-                self.evidence[..., experts] = (own - own.amax(-1, keepdim=True) + most).clamp_min(LEAST)
+                self.evidence[..., experts] = (own - own.amax(-1, keepdim=True) + most).clamp_min(E.LEAST)
         self.new_sequence()
 
     # -- pieces ---------------------------------------------------------------------------------
@@ -236,27 +216,27 @@ class MixtureResidual(MixtureQueries):
         # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
         # heeds the few large samples of a stream that mostly rests, too
         typical = self.tails.typical()
-        judged_by = typical * (RMS_LEAST * self.inflation.sqrt() / typical).clamp(1.0, RMS_MOST)
+        judged_by = typical * (E.RMS_LEAST * self.inflation.sqrt() / typical).clamp(1.0, E.RMS_MOST)
         innovation = y.unsqueeze(-1) - self._means(means)
         scale = (deviation * typical).unsqueeze(-1)
         far = _bounded(innovation / scale)
         r = (far * (typical / judged_by).unsqueeze(-1)).square()
-        evidence = MEMORY * self.evidence - 0.5 * (FREEDOM + 1.0) * torch.log1p(r / FREEDOM)
-        evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(LEAST)
+        evidence = MEMORY * self.evidence - 0.5 * (E.FREEDOM + 1.0) * torch.log1p(r / E.FREEDOM)
+        evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(E.LEAST)
         innovation = scale * far / (1.0 + (far / self._experts[4]).square())
-        trend = TREND_DECAY * self.trend + self._experts[3] * innovation
-        level = LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
-        sane = level.abs() <= FARTHEST * scale  # else it is of a time when y was another size
+        trend = E.TREND_DECAY * self.trend + self._experts[3] * innovation
+        level = E.LEVEL_DECAY * self.level + self._experts[2] * innovation + trend
+        sane = level.abs() <= E.FARTHEST * scale  # else it is of a time when y was another size
         trend, level = trend.where(sane, 0.0), level.where(sane, 0.0)
         z = _bounded((y - mean) / deviation)
-        rate = (1.0 / (self.count - YOUNG + 2.0).clamp_min(1.0)).clamp_min(RATE).unsqueeze(-1)
-        square = torch.minimum(z.square(), SQUARE_MOST * self.inflation)
+        rate = (1.0 / (self.count - E.YOUNG + 2.0).clamp_min(1.0)).clamp_min(E.RATE).unsqueeze(-1)
+        square = torch.minimum(z.square(), E.SQUARE_MOST * self.inflation)
         inflation = (self.inflation + rate * (square - self.inflation)).clamp_min(1e-12)
         news = {
             "evidence": evidence, "innovation": innovation, "level": level, "trend": trend,
             "inflation": inflation,
         }  # fmt: skip
-        judged = self.count >= YOUNG
+        judged = self.count >= E.YOUNG
         if mask is not None:
             judged = judged & mask
         for name, value in news.items():
@@ -265,7 +245,7 @@ class MixtureResidual(MixtureQueries):
             buffer.copy_(torch.where(on, value, buffer))
         nis = (z.square() / self.inflation).mean(-1)
         self.noise.observe(x, z / typical, judged)
-        self.tails.observe(z, (self.count - YOUNG).clamp_min(0.0), judged)
+        self.tails.observe(z, (self.count - E.YOUNG).clamp_min(0.0), judged)
         self.count += 1.0 if mask is None else mask.to(self.count.dtype)
         self._settle()
         return nis, mean, deviation * typical
@@ -282,7 +262,7 @@ class MixtureResidual(MixtureQueries):
 
 def _bounded(z: Tensor) -> Tensor:
     """Squares stay finite; what is farther off says nothing more."""
-    return z.nan_to_num(FARTHEST).clamp(-FARTHEST, FARTHEST)
+    return z.nan_to_num(E.FARTHEST).clamp(-E.FARTHEST, E.FARTHEST)
 
 
 def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:

@@ -40,13 +40,12 @@ class Answer(NamedTuple):
 class CompiledMixture:
     """Updates and queries of one sample per model, on the memory of the mixture and its learners.
 
-    Bound again whenever a buffer is another one. Learners that compiled loops do not know predict and learn
-    on their own, and are judged here.
+    Bound again whenever a buffer is another one. Torch does the work where loops do not know a learner.
     """
 
     def __init__(self) -> None:
         self._bound: Bound | None = None
-        self._plans: list[Plan | None] = []
+        self._plans: list[Any] = []  # one Plan for each learner, or None
 
     def __deepcopy__(self, memo: dict) -> CompiledMixture:
         return CompiledMixture()
@@ -59,79 +58,40 @@ class CompiledMixture:
     def ask(self, g: Any, x: Tensor, *wanted: str) -> Answer | None:
         """One query per model for these fields of an Answer; None: torch must do it."""
         bound = self._takes(g, x)
-        if bound is None or None in self._plans:
+        if bound is None:
             return None
-        x, one, two = (
-            x.contiguous(),
-            (*g.batch_shape, g.out_features),
-            (*g.batch_shape, g.out_features, g.in_features),
-        )
+        x, one = x.contiguous(), (*g.batch_shape, g.out_features)
+        two = *one, g.in_features
         shapes = zip(Answer._fields, (one, one, one, one, two, two), strict=True)
         found = Answer(*(x.new_empty(s if name == "mean" or name in wanted else 0) for name, s in shapes))
         loops: Any = load_loops()
         loops.query_mixture(bound.row, self._members, x.data_ptr(), *(t.data_ptr() for t in found))
         return found
 
-    @torch.no_grad()
     def learn(self, g: Any, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
         """All that an update does; None: torch must do it."""
         bound = self._takes(g, x)
         if bound is None or not is_plain_one(y, (*g.batch_shape, g.out_features)):
             return None
-        x, y, plans, learners = x.contiguous(), y.contiguous(), self._plans, self._learners
-        loops: Any = load_loops()
-        if not loops.are_finite(bound.row, x.data_ptr(), y.data_ptr()):
+        pairs = list(zip(self._plans, self._learners, strict=True))
+        if any(plan.is_rough(one) for plan, one in pairs):  # what it predicts would be another after that
             return None
-        n, m, k = len(bound.all), g.out_features, len(plans) - 1
-        (means, noisy), local = np.empty((2, n * m, k)), np.empty(n * m)
-        figures, events, errors = (
-            np.zeros((k + 1, 4, n)), np.zeros((k + 1, n), np.int64), np.zeros((k + 1, n, m))
-        )  # fmt: skip
-        of_all, said, judged = np.empty((3, n)), np.empty((2, n * m)), np.empty(n, np.bool_)
-        if mask is not None:
-            figures[:, 2] = 1.0
-        turns = []
-        for i, (plan, learner) in enumerate(zip(plans, learners, strict=True)):
-            if plan is None:
-                mean, variance = learner.moments(x, observation=True)
-                means[:, i], noisy[:, i] = mean.reshape(-1).numpy(), variance.reshape(-1).numpy()
-            # what a part does first would change what the learner predicts
-            apart = plan is None or (
-                plan.units is not None and plan.units.acts_before(learner.n_samples, learner)
-            )
-            turns.append(_SKIP if apart else learner.engine.begin(learner, x, y, mask))
+        loops: Any = load_loops()
+        x, y = x.contiguous(), y.contiguous()
+        of_all, said = np.empty((4, len(bound.all))), np.empty((2, y.numel()))
+        numbers = np.array([one.n_samples for one in self._learners])
         alarm = loops.update_mixture(
-            bound.row, self._members, np.array(turns), on_array(bound, mask), judged, x.data_ptr(),
-            y.data_ptr(), means, noisy, local, local.ctypes.data, said, figures, events, errors, of_all,
-        )  # fmt: skip
-        done_apart = False
-        for i, (plan, learner) in enumerate(zip(plans, learners, strict=True)):
-            t, on = y, mask
-            if i == k:
-                if not alarm >> k:
-                    break
-                t, on = (
-                    torch.from_numpy(a.reshape(s)) for a, s in ((local, y.shape), (judged, g.batch_shape))
-                )
-            if turns[i] is not _SKIP:
-                assert plan is not None
-                facing = i < k and bool(alarm >> i & 1)
-                learner.engine.finish(learner, x, t, on, facing, figures[i], events[i], errors[i])
-                continue
-            report = learner.step(x, t, on)
-            if i < k:
-                done_apart = True
-                events[i], figures[i, 0] = report.event.reshape(-1), report.novelty.reshape(-1)
-                figures[i, 2] = report.weight.reshape(-1)
-        if done_apart:
-            part = g.weights.mean(-2).reshape(n, k).T.numpy()
-            of_all[1], of_all[2] = (part * figures[:k, 0]).sum(0), (part * figures[:k, 2]).sum(0)
+            bound.row, self._members, numbers, on_array(bound, mask), x.data_ptr(), y.data_ptr(), said, of_all
+        )
+        if alarm < 0:  # not finite
+            return None
+        for i, (plan, one) in enumerate(pairs):
+            if i < len(pairs) - 1 or alarm >> i & 1:  # the last one's bit: the noise has learned
+                plan.act(one, bool(alarm >> i & 1))
         if g.returns is not None and (mask is None or bool(mask)):
-            changed = alarm >> g.watched & 1 or (turns[g.watched] is _SKIP and g.has_changed())
-            g.note_return(x, y.numpy(), said, float(of_all[0, 0]), bool(changed))
-        nis, novelty, weight = torch.from_numpy(of_all.reshape(3, *g.batch_shape)).unbind()
-        event = torch.from_numpy(events[:k].max(0).reshape(tuple(g.batch_shape)))
-        return UpdateReport(event, novelty, nis, weight)
+            g.note_return(x, y.numpy(), said, float(of_all[0, 0]), bool(alarm >> g.watched & 1))
+        nis, novelty, weight, event = torch.from_numpy(of_all.reshape(4, *g.batch_shape)).unbind()
+        return UpdateReport(event.to(torch.int64), novelty, nis, weight)
 
     # -- what they work on ----------------------------------------------------------------------
 
@@ -143,13 +103,12 @@ class CompiledMixture:
             return None
         if self._bound is None or not self._bound.is_current():
             self._bound = self._bind(g)
-            self._learners, self._noise = [*g.members, g.noise.gp], _plan(g.noise.gp)
-        plans = [*map(_plan, self._learners[:-1]), self._noise]  # nobody else changes the GP of the noise
+            self._learners = [*g.members, g.noise.gp]
+        plans = [*map(_plan, self._learners)]
         if plans != self._plans:
             self._plans = plans
-            none = np.zeros(P.FIELDS, np.int64)
-            self._members = np.stack([none if plan is None else plan.row for plan in plans])
-        return self._bound if self._bound.usable and plans[-1] is not None else None
+            self._members = np.stack([plan.row for plan in plans if plan is not None])
+        return self._bound if self._bound.usable and None not in plans else None
 
     def _bind(self, g: Any) -> Bound:
         bound, tails = Bound(), g.tails
@@ -181,6 +140,3 @@ def _plan(learner: Any) -> Plan | None:
     """What compiled loops know of a learner; None: nothing."""
     engine = getattr(learner, "engine", None)
     return engine.of(learner) if isinstance(engine, CompiledEngine) else None
-
-
-_SKIP = P.SKIP, -1, -1, -1, -1, 0

@@ -57,10 +57,9 @@ class MixtureQueries(ResidualLearner):
         if found is not None:
             return Normal(found.mean, found.deviation, validate_args=False)
         x = self.check_query(x)
-        each = [learner.both_moments(x) for learner in self.members]
-        mean, deviation, means = self._together([(m, v) for m, _, v in each])
+        mean, deviation, means = self._together([one.moments(x, observation=True) for one in self.members])
         deviation = deviation * self.inflation.sqrt() * self.noise.log_factor(x).exp().to(x.dtype)
-        variances = self._wide(torch.stack([v for _, v, _ in each], dim=-1).to(x.dtype))
+        variances = self._wide(torch.stack([one.moments(x)[1] for one in self.members], dim=-1).to(x.dtype))
         variance = self._spread(variances, self._apart(means, mean))
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
         return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)

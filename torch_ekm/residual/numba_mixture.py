@@ -3,8 +3,7 @@
 Equations and names are those of :class:`~torch_ekm.residual.MixtureResidual` and
 :class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a row of
 :mod:`~torch_ekm.residual.mixture_plan`, ``members`` has one row of
-:mod:`~torch_ekm.residual.sparse_gp.plan` for each learner, and one for the GP of LocalNoise; of another kind
-of learner it is 0, and what it predicts is given.
+:mod:`~torch_ekm.residual.sparse_gp.plan` for each learner, and one for the GP of LocalNoise.
 """
 
 from __future__ import annotations
@@ -21,18 +20,20 @@ from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
-from .sparse_gp.engine.numba_math import A1, A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
+from .sparse_gp.engine.numba_math import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
 
-are_finite, query_fleet, update_fleet = gp.are_finite, gp.query_fleet, gp.update_fleet
+embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
 
 
-@njit(types.void(I1, A3, A2), **INNER)
-def _of_all(g, figures, of_all):
-    """Novelty and weight of a sample, by the say of each learner."""
+@njit(types.void(I1, A3, I2, A2), **INNER)
+def _of_all(g, figures, events, of_all):
+    """Novelty and weight of a sample by the say of each learner, and the largest event."""
     m, n_learners = g[P.OUT], figures.shape[0] - 1
     n_groups = n_learners * g[G.N_SHARES]
     for b in range(g[P.MODELS]):
-        of_all[1, b] = of_all[2, b] = 0.0
+        of_all[1, b] = of_all[2, b] = of_all[3, b] = 0.0
+        for i in range(n_learners):
+            of_all[3, b] = max(of_all[3, b], events[i, b])
         for r in range(b * m, (b + 1) * m):
             mass = vector_at(g[G.MASS], r, n_groups)
             for k in range(n_groups):
@@ -41,40 +42,37 @@ def _of_all(g, figures, of_all):
                 of_all[2, b] += mass[k] * figures[i, 2, b] / m
 
 
-@njit(INT(I1, I2, I2, ON, ON, INT, INT, A2, A2, A1, INT, A2, A3, I2, A3, A2), **COMMON)
-def update_mixture(
-    g, members, turns, on, judged_on, x, y, means, noisy, local, local_address, said, figures, events,
-    errors, of_all,
-):  # fmt: skip
+@njit(INT(I1, I2, I1, ON, INT, INT, A2, A2), **COMMON)
+def update_mixture(g, members, numbers, on, x, y, said, of_all):
     """One sample per model where ``on``: all learners predict, the mixture judges them, they learn.
 
     Args:
-        turns: what each learner does, see its plan.
+        numbers: of samples that each learner has seen.
         x, y: addresses.
-        judged_on: where the mixture judged, and so the noise learned.
-        local: room for what the noise learns, at that address.
         said: room for mean and typical deviation of y, ``(2, models out)``.
-        means, noisy: of y, from learners of other kinds, ``(models out, learners)``.
-        figures, events, errors: see ``update_fleet``, one for each learner.
-        of_all: nis, novelty and weight of the mixture, ``(3, models)``; the last two where all learned here.
+        of_all: room for nis, novelty, weight and event of the mixture, ``(4, models)``.
 
     Returns:
-        A bit for each learner of which a model faces another system, and one that the noise learned.
+        A bit for each learner of which a model faces another system, and one that the noise learned; -1: a
+        sample is not finite, and nothing was done.
     """
+    if not gp.are_finite(g, x, y):
+        return -1
     B, d, m, n_learners = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
     far, p, inside = np.empty(g[G.N_EXPERTS]), np.empty(g[G.N_EXPERTS]), np.empty(m)
     mean, noise, t, found = np.empty(m), np.empty(m), np.empty(m), np.empty(4)
+    means, noisy, local = np.empty((B * m, n_learners)), np.empty((B * m, n_learners)), np.empty(B * m)
+    figures, errors = np.zeros((n_learners + 1, 4, B)), np.zeros((n_learners + 1, B, m))
+    events, judged_on = np.zeros((n_learners + 1, B), np.int64), np.empty(B, np.bool_)
+    figures[:, 2] = 1.0  # the weight where there is no sample
     total = 0
     for i in range(n_learners + 1):
-        if members[i, P.MODELS]:
-            total += B * (gp.values_of(members[i]) + members[i, P.WIDTH] + 2 * members[i, P.SLOTS] + 1)
+        total += B * (members[i, P.VALUES] + members[i, P.WIDTH] + 2 * members[i, P.SLOTS] + 1)
     room, at, alarm = np.empty(total), 0, 0  # what is found for predictions serves the update
     gp.grow_largest(g, on, y)
     for i in range(n_learners + 1):
         a = members[i]
-        if not a[P.MODELS]:
-            continue
-        n, W, M = gp.values_of(a), a[P.WIDTH], a[P.SLOTS]
+        n, W, M = a[P.VALUES], a[P.WIDTH], a[P.SLOTS]
         psi, phi = np.empty(M), np.empty(M)
         for b in range(B):
             values, q = room[at : at + n], room[at + n : at + n + W]
@@ -87,7 +85,7 @@ def update_mixture(
                     local[b * m + o] = mean[o]
             else:
                 gp.noise_of(a, b, noise)
-                scale = vector_at(a[P.SCALE_Y], b * a[P.OWN_UNITS], m)
+                scale = vector_at(a[P.SCALE_Y], b, m)
                 for o in range(m):
                     means[b * m + o, i] = mean[o]
                     noisy[b * m + o, i] = v * scale[o] * scale[o] + noise[o]
@@ -95,10 +93,10 @@ def update_mixture(
             at += n + W + 2 * M + 1
     for b in range(B):
         count, nis = vector_at(g[G.COUNT], b, 1), 0.0
+        judged = on[b] and count[0] >= E.YOUNG
+        since = max(count[0] - E.YOUNG, 0.0)
         for r in range(b * m, (b + 1) * m):
             make_finite(g, r, means[r], noisy[r])
-            judged = on[b] and count[0] >= E.YOUNG
-            since = max(count[0] - E.YOUNG, 0.0)
             nis += (
                 judge(g, r, vector_at(y, r, 1)[0], judged, since, means[r], noisy[r], far, p, local, said) / m
             )
@@ -111,16 +109,14 @@ def update_mixture(
     for i in range(n_learners + 1):
         a, learned, on_ = members[i], y, on
         if i == n_learners:
-            learned, on_ = local_address, judged_on
+            learned, on_ = local.ctypes.data, judged_on
             if not alarm >> n_learners & 1:
                 break
-        if not a[P.MODELS]:
-            continue
-        n, W, M = gp.values_of(a), a[P.WIDTH], a[P.SLOTS]
+        n, W, M = a[P.VALUES], a[P.WIDTH], a[P.SLOTS]
         for b in range(B):
             values, q = room[at : at + n], room[at + n : at + n + W]
             k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
-            if on_[b] and turns[i, P.MODE] != P.SKIP:
+            if on_[b]:
                 prior = room[at + n + W + 2 * M]
                 events[i, b] = gp.learn(
                     a, b, values, q, k, Ck, prior, vector_at(learned, b, m), t, found, errors[i, b]
@@ -128,9 +124,9 @@ def update_mixture(
                 for r in range(4):
                     figures[i, r, b] = found[r]
             at += n + W + 2 * M + 1
-        if gp.note(a, turns[i], on_, x, learned, figures[i], errors[i]):
+        if gp.note(a, numbers[i], on_, x, learned, figures[i], errors[i]):
             alarm |= 1 << i
-    _of_all(g, figures, of_all)
+    _of_all(g, figures, events, of_all)
     return alarm
 
 

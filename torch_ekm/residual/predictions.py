@@ -71,11 +71,6 @@ class Predictions(nn.Module, ABC):
         law = self.predict(x, observation=observation)
         return law.mean, law.variance
 
-    def both_moments(self, x: Float[Tensor, "*any in_features"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, variance of g and variance of y, see :meth:`moments`."""
-        mean, variance = self.moments(x)
-        return mean, variance, self.moments(x, observation=True)[1]
-
     @torch.no_grad()
     def sample(
         self,
@@ -95,10 +90,10 @@ class Predictions(nn.Module, ABC):
         """
         x = self.check_query(x)
         z = self.unit_draws(x, check_count("n", n), generator)
-        mean, latent, noisy = self.both_moments(x)
+        mean, latent = self.moments(x)
         if not observation:
             return mean + latent.sqrt() * z
-        share = (latent / noisy).clamp(0.0, 1.0)
+        share = (latent / self.moments(x, observation=True)[1]).clamp(0.0, 1.0)
         own = torch.randn(z.shape, generator=generator, dtype=z.dtype, device=z.device)
         return self._placed(x, share.sqrt() * z + (1.0 - share).sqrt() * own, generator)
 

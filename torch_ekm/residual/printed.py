@@ -40,9 +40,8 @@ def sparse_gp(gp: Any) -> list[str]:
         f"kernel {kernel_in_words(gp.kernel)}",
         f"noise of y: {numbers(gp.noise_variance.sqrt())}",
     ]
-    if units.affine():
-        shift, scale, _, scale_y = map(numbers, units.affine())
-        lines.append(f"units: (x - [{shift}]) / [{scale}], y / [{scale_y}]")
+    shift, scale, scale_y = map(numbers, (units.input.shift, units.input.scale, units.output.scale))
+    lines.append(f"units: (x - [{shift}]) / [{scale}], y / [{scale_y}]")
     parts = (f"{type(part).__name__}({part.extra_repr()})" for part in gp.parts)
     return [*lines, f"parts: {', '.join(parts)}"]
 

@@ -48,14 +48,12 @@ class UpdateReport:
     def of(
         nis: Float[Tensor, "*batch"],
         mask: Bool[Tensor, "*batch"] | None = None,
-        novelty: Float[Tensor, "*batch"] | None = None,
         weight: Float[Tensor, "*batch"] | None = None,
     ) -> UpdateReport:
-        """Of samples that were taken in; without a basis no novelty, and by default weight 1."""
+        """Of samples that were taken in, by a learner without a basis; by default of weight 1."""
         one = torch.ones_like(nis)
         event = (one if mask is None else mask).to(torch.int64)
-        novelty = 0.0 * one if novelty is None else novelty
-        return UpdateReport(event, novelty, nis, one if weight is None else weight)
+        return UpdateReport(event, torch.zeros_like(nis), nis, one if weight is None else weight)
 
     @staticmethod
     def stack(reports: list[UpdateReport]) -> UpdateReport:

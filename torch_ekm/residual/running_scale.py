@@ -10,7 +10,7 @@ from torch import nn
 from .._arrays import is_plain, namespace
 from ..typing import AnyArray, Bool, Float, Tensor
 
-BLOCK = 32  #: samples of a block; those before the first one is full count from the first on
+BLOCK = 32  #: samples of a block
 _TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
 # below this share of what the eighth leaves in, the rest stands still and these are no outliers
 _SPIKES = 0.03
@@ -21,11 +21,6 @@ _DOUBT = 2.0  # so many large ones are taken to be alone beforehand
 _REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
 REACH = 10.0  #: scales beyond which z goes no further, in columns where that matters
 ALIEN = 1e-20  #: a variation below this share is no rest either: what was before was wrong
-
-
-def write(buffer: Float[Tensor, "*batch places n"], place: int, values: Float[Tensor, "*batch n"]) -> None:
-    """``buffer[..., place, :] = values``, which takes torch three times as long."""
-    buffer.select(-2, place).copy_(values)
 
 
 class RunningScale(nn.Module):
@@ -41,8 +36,8 @@ class RunningScale(nn.Module):
     Exempt columns are scaled by their root mean square. Nothing is squared before it is divided by the
     largest: 1e150 is a number like others. A past that is 1e20 times as large as what comes is forgotten.
 
-    :meth:`observe` takes samples in, :meth:`settle` adopts what was found. In between ``shift`` and ``scale``
-    stand still, so that what was computed with them stays valid.
+    :meth:`pool` takes a block of samples in, :meth:`settle` adopts what was found. In between ``shift`` and
+    ``scale`` stand still, so that what was computed with them stays valid.
 
     An input that stood still has the scale of its jitter until it moves: then its z is of any size. What
     grows with z without end takes it for ``REACH`` at most.
@@ -77,8 +72,6 @@ class RunningScale(nn.Module):
         self.spread = nn.Buffer(torch.zeros(shape, **factory))
         self.weight = nn.Buffer(torch.zeros(shape, **factory))
         self.large = nn.Buffer(torch.zeros(*shape, 2, **factory))  # large samples, and those of them alone
-        self.block = nn.Buffer(torch.zeros(*batch_shape, BLOCK, features, **factory))
-        self.block_on = nn.Buffer(torch.zeros(*batch_shape, BLOCK, 1, **factory))
         columns = torch.tensor(shifted or [False] * features, dtype=dtype, device=device)
         self.shifted = nn.Buffer(columns)
         self.cuts = any(grows or ())
@@ -86,43 +79,34 @@ class RunningScale(nn.Module):
         self.reach = nn.Buffer(torch.tensor(reach, **factory), persistent=False)
 
     def forward(self, x: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch features"]:
-        """x, or its first columns, in the learner's units."""
-        n = x.shape[-1]
-        return self._cut((x - self.shift[..., :n]) / self.scale[..., :n])
+        """x in the learner's units."""
+        return self._cut((x - self.shift) / self.scale)
 
     def of_sets(self, x: Float[Tensor, "*batch n features"]) -> Float[Tensor, "*batch n features"]:
         """n samples of each model in the learner's units."""
         return self._cut((x - self.shift.unsqueeze(-2)) / self.scale.unsqueeze(-2))
 
     def _cut(self, z: Tensor) -> Tensor:
-        reach = self.reach[: z.shape[-1]]
-        return z.clamp(-reach, reach) if self.cuts else z
+        return z.clamp(-self.reach, self.reach) if self.cuts else z
 
     def follows(self, z: Float[Tensor, "*any features"]) -> Bool[Tensor, "*any features"]:
         """Columns in which z changes with x: where it was not cut."""
         return z.abs() < self.reach
 
-    def observe(self, place: int, x: Float[Tensor, "*batch features"], on: Tensor | None) -> None:
-        """A sample ``(*batch, features)`` of the models ``on``, at its place in the block; the last pools.
+    def pool(self, block: Float[Tensor, "*batch n features"], on: Float[Tensor, "*batch n"]) -> None:
+        """Take samples in, in their order, of the models where ``on`` is 1."""
+        pooled = self.weight, self.centre, self.spread, self.large
+        for buffer, found in zip(pooled, _pooled(self, block, on), strict=True):
+            buffer.copy_(torch.as_tensor(found))
 
-        ``on`` None: all models.
-        """
-        write(self.block, place, x)
-        row = self.block_on.select(-2, place)
-        row.fill_(1.0) if on is None else row.copy_(on.unsqueeze(-1))
-        if place == BLOCK - 1:
-            pooled = self.weight, self.centre, self.spread, self.large
-            for buffer, found in zip(pooled, _pooled(self), strict=True):
-                buffer.copy_(torch.as_tensor(found))
-
-    def settle(self, *, young: bool = False, settled: float = 0.1) -> tuple[Tensor, Tensor]:
+    def settle(self, *young: Tensor, settled: float = 0.1) -> tuple[Tensor, Tensor]:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
 
         Args:
-            young: the block that is not yet full counts, and every change is worth new units.
+            young: a block as of :meth:`pool` that counts, too; every change is worth new units then.
             settled: relative change of a scale (of a shift in units of it) that is not worth new units.
         """
-        found = _pooled(self) if young else (self.weight, self.centre, self.spread)
+        found = _pooled(self, *young) if young else (self.weight, self.centre, self.spread)
         weight, centre, spread = map(torch.as_tensor, found[:3])
         floor = 100 * torch.finfo(spread.dtype).eps * centre.abs()
         usable = (spread > floor) & (spread > torch.finfo(spread.dtype).tiny)
@@ -140,13 +124,11 @@ class RunningScale(nn.Module):
         """What comes decides alone on these models' scales; until then they are what they were."""
         for buffer in (self.weight, self.centre, self.spread):
             buffer.masked_fill_(models.unsqueeze(-1), 0.0)
-        for buffer in (self.large, self.block_on):
-            buffer.masked_fill_(models[..., None, None], 0.0)
+        self.large.masked_fill_(models[..., None, None], 0.0)
 
     def reset(self) -> None:
         """Forget all samples: shift 0 and scale 1 again."""
-        kept = self.shift, self.centre, self.spread, self.weight, self.large, self.block, self.block_on
-        for buffer in kept:
+        for buffer in (self.shift, self.centre, self.spread, self.weight, self.large):
             buffer.zero_()
         self.scale.copy_(self._first())
 
@@ -160,14 +142,54 @@ class RunningScale(nn.Module):
         return f"shift={shift}, scale={scale}"
 
 
-def _pooled(scale: RunningScale) -> tuple[AnyArray, ...]:
+class Units(nn.Module):
+    """The units in which a learner works, ``z = (x - shift) / scale``, and y the same: 0 and 1 at first.
+
+    Args:
+        input, output: scales of x and y.
+    """
+
+    def __init__(self, input: RunningScale, output: RunningScale) -> None:
+        super().__init__()
+        self.input, self.output = input, output
+
+    def of_sets(
+        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"]
+    ) -> tuple[Tensor, Tensor]:
+        """n samples of each model in the learner's units."""
+        return self.input.of_sets(x), self.output.of_sets(y)
+
+    def value(self, value: Float[Tensor, "*any out_or_1"], power: int) -> Tensor:
+        """An output in its own unit, or (power 2) a variance in its square."""
+        scale = self.output.scale
+        return value * scale + self.output.shift if power == 1 else value * scale.square()
+
+    def slope(
+        self, slope: Float[Tensor, "*any out_or_1 in"], power: int, z: Float[Tensor, "*any in"]
+    ) -> Float[Tensor, "*any out in"]:
+        """The derivative of such a value by x; z is that x in the learner's units."""
+        slope = slope * self.output.scale.pow(power).unsqueeze(-1) / self.input.scale.unsqueeze(-2)
+        return slope * self.input.follows(z).unsqueeze(-2) if self.input.cuts else slope
+
+    def pool(self, x: Tensor, y: Tensor, on: Tensor) -> None:
+        """Take a block in, see RunningScale."""
+        self.input.pool(x, on)
+        self.output.pool(y, on)
+
+    def reset(self) -> None:
+        """Back to z = x, t = y."""
+        self.input.reset()
+        self.output.reset()
+
+
+def _pooled(scale: RunningScale, block: Tensor, on: Tensor) -> tuple[AnyArray, ...]:
     """Weight, centre, spread and large samples of the past and the block together."""
-    names = "block", "block_on", "shifted", "weight", "centre", "spread", "large"
-    buffers = [scale.get_buffer(name) for name in names]
+    names = "shifted", "weight", "centre", "spread", "large"
+    tensors = block, on.unsqueeze(-1), *map(scale.get_buffer, names)
     # in numpy, see _arrays, where these are numbers alone
-    kept = [t.numpy() for t in buffers] if is_plain(*buffers) else buffers
-    at = SimpleNamespace(memory=scale.memory, **dict(zip(names, kept, strict=True)))
-    xp, tiny = namespace(at.block), torch.finfo(scale.block.dtype).tiny
+    kept = [t.numpy() for t in tensors] if is_plain(*tensors) else tensors
+    at = SimpleNamespace(memory=scale.memory, **dict(zip(("block", "block_on", *names), kept, strict=True)))
+    xp, tiny = namespace(at.block), torch.finfo(block.dtype).tiny
     count, centre, spread, large = _of_block(at, tiny)
     share, *drop = _REST[0], *(xp.asarray(value, dtype=xp.float32) for value in (_REST[1], 1.0))
     past = xp.where((spread == 0) | (spread > ALIEN * at.spread), at.spread, 0.0)
@@ -188,7 +210,7 @@ def _of_block(at: SimpleNamespace, tiny: float) -> tuple[AnyArray, ...]:
     """Number of samples, centre and spread of the block without its outliers; large ones up to now."""
     xp, on = namespace(at.block), at.block_on > 0
     count = at.block_on.sum(-2)
-    n, rank = count[..., None, :], xp.arange(BLOCK, device=at.block.device)[:, None]
+    n, rank = count[..., None, :], xp.arange(at.block.shape[-2], device=at.block.device)[:, None]
     ordered = _sorted(xp.where(on, at.block, xp.inf))
     middle = xp.where(rank == (n - 1.0).clip(0.0) // 2, ordered, 0.0).sum(-2)
     middle = xp.where(at.shifted * count > 0, middle, 0.0)

@@ -36,7 +36,6 @@ class LinearInFeatures(ScaledLearner):
     """
 
     refresh_every = 16  #: samples between two rebuilds
-    grows = False  #: whether features grow with x without end
 
     def __init__(
         self,
@@ -62,7 +61,6 @@ class LinearInFeatures(ScaledLearner):
         self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
         self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         self.pending = nn.Buffer(zeros(self.batch_shape))
-        self._make_units([True] * self.in_features, self.dtype, [self.grows] * self.in_features)
 
     @abstractmethod
     def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:

@@ -63,7 +63,6 @@ class ReplayMLP(ScaledLearner, SingleLearner):
             self.register_buffer(f"start_{i}", torch.zeros_like(p))
         self.adam = Adam(self.theta)
         self._clear()
-        self._make_units([True] * self.in_features, self.dtype)
 
     @property
     def _start(self) -> list[Tensor]:

@@ -2,19 +2,19 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch.distributions import Normal
 
-from ..._checks import check_sizes
-from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..base import ResidualLearner
+from ..derivatives import value_and_jacobian
 from ..misled import Misled
+from ..recent import Recent
 from ..report import UpdateReport
-from ..running_scale import BLOCK, RunningScale
+from ..running_scale import BLOCK
+from ..sparse_gp.units import Standardize
 
 _FAR = 2.3  # logarithm of a change of units after which a learner starts again
 _CUT = 6.0  # largest target in its own units
@@ -32,43 +32,24 @@ class ScaledLearner(ResidualLearner):
     A subclass implements f: ``_mean``, ``_law``, ``_slopes``, ``_learn``, ``_clear`` and ``_follow``.
 
     Args:
-        standardize: whether it learns units; else x and y are taken as they are.
-        output_offset: ``"zero"``, or ``"learned"``: y is centred too.
-        input_resolution, output_scale: sizes below which x and y mean nothing, see Standardize.
+        standardize: whether it learns units, or how; else x and y are taken as they are.
         options: see ResidualLearner.
     """
 
     settled = 0.1  #: relative change of units that is not worth adopting
+    grows = False  #: whether f grows with x without end
 
     def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        standardize: bool = True,
-        output_offset: Literal["zero", "learned"] = "zero",
-        input_resolution: float | Sequence[float] = 0.0,
-        output_scale: float | Sequence[float] = 0.0,
-        **options: Any,
+        self, in_features: int, out_features: int, *, standardize: bool | Standardize = True, **options: Any
     ) -> None:
         super().__init__(in_features, out_features, **options)
-        if output_offset not in ("zero", "learned"):
-            raise ParameterError("output_offset", output_offset, "'zero' or 'learned'")
-        self.standardize, self.output_offset = bool(standardize), output_offset
-        self._least = (
-            check_sizes("input_resolution", input_resolution, in_features),
-            check_sizes("output_scale", output_scale, out_features),
-        )
+        self.standardize, self.n_samples = bool(standardize), 0
+        fleet = {"batch_shape": self.batch_shape, "dtype": self.dtype, "device": self.device}
+        units = standardize if isinstance(standardize, Standardize) else Standardize()
+        columns = [True] * self.in_features, [self.grows and self.standardize] * self.in_features
+        self.units = units.units(self.in_features, self.out_features, *columns, **fleet)
+        self.recent = Recent(self.in_features, self.out_features, BLOCK, **fleet)
         self.misled = Misled(tuple(self.batch_shape), self._kept, self.device)
-        self.n_samples = 0
-
-    def _make_units(self, shifted: list[bool], dtype: torch.dtype, grows: list[bool] | None = None) -> None:
-        """Last in a constructor."""
-        options = {"batch_shape": self.batch_shape, "dtype": dtype, "device": self.device}
-        if self.standardize:
-            centred = [self.output_offset == "learned"] * self.out_features
-            self.input = RunningScale(self.in_features, shifted, grows, self._least[0], **options)
-            self.output = RunningScale(self.out_features, centred, least=self._least[1], **options)
 
     # -- f, in its own units --------------------------------------------------------------------
 
@@ -81,8 +62,9 @@ class ScaledLearner(ResidualLearner):
         """Mean and variance of f(z), or of t."""
 
     def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """f(z) and df/dz; autograd here."""
-        raise NotImplementedError
+        """f(z) and df/dz ``(*any, out, in)``; autograd here."""
+        mean, slope = value_and_jacobian(self._mean, z)
+        return mean, z.new_zeros(*mean.shape, z.shape[-1]) if slope is None else slope
 
     def _slope_variance(self, z: Tensor) -> Tensor:
         """Of each column of df/dz, ``(*any, in)``; NaN: not stated."""
@@ -108,27 +90,20 @@ class ScaledLearner(ResidualLearner):
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Mean and deviation of g, or of y."""
         mean, variance = self._law(self._inputs(self.check_query(x)), observation)
-        deviation = variance.sqrt().expand_as(mean)
-        if self.standardize:
-            deviation = deviation * self.output.scale
+        deviation = variance.sqrt().expand_as(mean) * self.units.output.scale
         return Normal(self._value(mean), deviation.to(self.dtype), validate_args=False)
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        if type(self)._slopes is ScaledLearner._slopes:
-            return super().linearize(x)
         z = self._inputs(self.check_query(x))
         mean, slope = self._slopes(z)
-        if self.standardize:
-            slope = slope * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
-            slope = slope * self.input.follows(z).unsqueeze(-2)
-        return self.bounded_slope(self._unbounded(mean), slope.to(self.dtype))
+        mean, slope = self.units.value(mean, 1), self.units.slope(slope, 1, z)
+        return self.bounded_slope(mean.to(self.dtype), slope.to(self.dtype))
 
     def slope_deviation(self, x: Tensor) -> Tensor:
         """Of the same for all outputs, but for their scales."""
         z = self._inputs(self.check_query(x))
         deviation = self._slope_variance(z).clamp_min(0.0).sqrt().unsqueeze(-2)
-        if self.standardize:
-            deviation = deviation * self.output.scale.unsqueeze(-1) / self.input.scale.unsqueeze(-2)
+        deviation = self.units.slope(deviation, 1, torch.zeros_like(z))
         return deviation.expand(*deviation.shape[:-2], self.out_features, -1).to(self.dtype)
 
     def reset(self) -> None:
@@ -138,35 +113,34 @@ class ScaledLearner(ResidualLearner):
         self.n_samples = 0
         self.misled.level.zero_()
         self._clear()
-        if self.standardize:
-            self.input.reset()
-            self.output.reset()
+        self.units.reset()
+        self.recent.reset()
 
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
         if self.standardize:
             self._observe(x, y, mask)
         self.n_samples += 1
-        z = self._inputs(x)
-        t = self.output(y) if self.standardize else y
+        z, t = self._inputs(x), self.units.output(y)
         self.misled.observe(t - self._mean(z), t, mask)
         misled = self.misled.found()
         if misled is not None:
             self._clear(misled)
-            if self.standardize:
-                self.output.forget(misled)
+            self.units.output.forget(misled)
+            self.recent.on.masked_fill_(misled.unsqueeze(-1), 0.0)
         return self._learn(z, self._targets(y), mask)
 
     def _observe(self, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
         n, on = self.n_samples, None if mask is None else mask.to(x.dtype)
-        place = n % BLOCK
-        self.input.observe(place, x, on)
-        self.output.observe(place, y, on)
+        units, recent = self.units, self.recent
+        recent.keep(n, x, y, on)
         if n + 1 < BLOCK and n & (n + 1) == 0:
-            self.input.settle(young=True)
-            self.output.settle(young=True)
+            x, y, on, _ = recent.last(n + 1, n + 1)
+            units.input.settle(x, on)
+            units.output.settle(y, on)
             self._learn_block(n)
         elif (n + 1) % BLOCK == 0:
-            changes = self.input.settle(settled=self.settled), self.output.settle(settled=self.settled)
+            units.pool(recent.x, recent.y, recent.on)
+            changes = units.input.settle(settled=self.settled), units.output.settle(settled=self.settled)
             ratios = torch.cat([changes[0][1], changes[1][1]], dim=-1).log().abs()
             if bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
                 self._follow(*changes)
@@ -178,26 +152,21 @@ class ScaledLearner(ResidualLearner):
         """Again, from the first n samples of the present block only; all models, or these."""
         self._clear(models)
         for i in range(n):
-            on = self.input.block_on[..., i, 0] * self.output.block_on[..., i, 0] > 0
+            on = self.recent.on[..., i] > 0
             on = on if models is None else on & models
             if not bool(on.any()):  # nothing, or of a time that is forgotten
                 continue
-            x, y = self.input.block[..., i, :], self.output.block[..., i, :]
+            x, y = self.recent.x[..., i, :], self.recent.y[..., i, :]
             self._learn(self._inputs(x), self._targets(y), on if self.batch_shape else None)
 
     def _inputs(self, x: Float[Tensor, "*any in"]) -> Tensor:
-        return self.input(x) if self.standardize else x
+        return self.units.input(x)
 
     def _targets(self, y: Float[Tensor, "*batch out"]) -> Tensor:
-        return self.output(y).clamp(-_CUT, _CUT) if self.standardize else y
+        return self.units.output(y).clamp(-_CUT, _CUT) if self.standardize else y
 
     def _value(self, mean: Float[Tensor, "*any out"]) -> Tensor:
-        return self.bounded(self._unbounded(mean))
-
-    def _unbounded(self, mean: Float[Tensor, "*any out"]) -> Tensor:
-        if self.standardize:
-            mean = mean * self.output.scale + self.output.shift
-        return mean.to(self.dtype)
+        return self.bounded(self.units.value(mean, 1).to(self.dtype))
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm continues after a reload."""

@@ -69,10 +69,6 @@ class ActionLinearKernel(Kernel):
         (s, a), (sz, az) = self.split(x), self.split(z)
         return self.state_kernel(s, sz) * ((a * self.action_variance.unsqueeze(-2)) @ az.mT)
 
-    def vector(self, x: Tensor, z: Tensor) -> Tensor:
-        (s, a), (sz, az) = self.split(x), self.split(z)
-        return self.state_kernel.vector(s, sz) * (az * (a * self.action_variance).unsqueeze(-2)).sum(-1)
-
     def diagonal(self, x: Tensor) -> Tensor:
         s, a = self.split(x)
         return self.state_kernel.diagonal(s) * (a * a * self.action_variance).sum(-1)

@@ -79,16 +79,8 @@ class DeepKernel(Kernel):
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         a = self.embed(x)
-        b = a if z is x else self.embed(z)
-        centre = b[..., :1, :].detach()  # see StationaryKernel
-        d2 = squared_distances(a - centre, b - centre)
+        d2 = squared_distances(a, a if z is x else self.embed(z))
         return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2)
-
-    def vector(self, x: Tensor, z: Tensor) -> Tensor:
-        w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
-        row = x.unsqueeze(-2)
-        d2 = ((z - row) * w).square().sum(-1) + (self.net(z) - self.net(row)).square().sum(-1)
-        return self.base.log_variance.exp().unsqueeze(-1) * self.base.phi(d2)
 
     @torch.no_grad()
     def with_pullback(self, x: Tensor, rows: int) -> tuple[Tensor, Tensor, Pullback]:
@@ -121,11 +113,6 @@ class DeepKernel(Kernel):
         phi, psi = self.base.phi_psi(near.square().sum(-1) + far.square().sum(-1))
         v = self.base.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (near * w + far @ slope.mT)
-
-    def derivative_variance(self, x: Tensor) -> Tensor:
-        w = self.base.log_lengthscale.neg().exp()
-        metric = w.square() + self.net_jacobian(x)[1].square().sum(-1)
-        return metric * self.base.curvature().unsqueeze(-1)
 
     def shift_invariant(self, in_features: int) -> list[bool]:
         # not invariant, but the network learns any shift: centred inputs keep tanh in its range

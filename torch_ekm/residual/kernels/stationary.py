@@ -14,7 +14,12 @@ from .kernel import Kernel, Pullback, log_parameter
 
 
 def squared_distances(x: Float[Tensor, "*any n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
-    """``|x_i - z_j|^2`` by one product, ``(*batch, n, m)``: for points near 0, see StationaryKernel."""
+    """``|x_i - z_j|^2``, ``(*batch, n, m)``."""
+    if x.shape[-2] == 1:  # differences are exact; products are faster for many queries
+        return (z - x).square().sum(-1).unsqueeze(-2)
+    # about one of the points: far from 0 the difference of large squares would be all rounding
+    centre = z[..., :1, :].detach()
+    x, z = x - centre, z - centre
     d2 = x.square().sum(-1).unsqueeze(-1) + z.square().sum(-1).unsqueeze(-2)
     return (d2 - 2.0 * x @ z.mT).clamp_min(0.0)
 
@@ -71,12 +76,7 @@ class StationaryKernel(Kernel):
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         w = self.log_lengthscale.neg().exp().unsqueeze(-2)
-        if x.shape[-2] == 1:  # differences are exact; products are faster for many queries
-            d2 = ((z - x) * w).square().sum(-1).unsqueeze(-2)
-        else:
-            # about one of the points: far from 0 the difference of large squares would be all rounding
-            centre = z[..., :1, :].detach()
-            d2 = squared_distances((x - centre) * w, (z - centre) * w)
+        d2 = squared_distances(x * w, z * w)
         return self.log_variance.exp()[..., None, None] * self.phi(d2)
 
     @torch.no_grad()
@@ -93,7 +93,7 @@ class StationaryKernel(Kernel):
         With ``D = dloss/dd2 = -1/2 v psi dloss/dk`` the loss has the derivative ``2 (r_i a_i - D a)`` by a
         point, r the sums of D's rows. Derivatives are by log L, by the further columns and by log v.
         """
-        a = a - a[..., :1, :]  # see forward
+        a = a - a[..., :1, :]  # see squared_distances
         few, v, d = a[..., :rows, :], self.log_variance.exp()[..., None, None], self.log_lengthscale.shape[-1]
         phi, psi = self.phi_psi(squared_distances(few, a))
         K, diagonal = phi.mul_(v) if phi is not psi else v * phi, v.squeeze(-1).expand(a.shape[:-1])
@@ -109,14 +109,6 @@ class StationaryKernel(Kernel):
 
         return K, diagonal, back
 
-    def vector(self, x: Tensor, z: Tensor) -> Tensor:
-        w = self.log_lengthscale.neg().exp().unsqueeze(-2)
-        u = torch.addcmul(x.unsqueeze(-2) * w, z, w, value=-1.0)
-        # In a large fleet fresh memory costs more than arithmetic. The norm takes none, but it has no
-        # second derivative at 0.
-        d2 = u.square().sum(-1) if torch.is_grad_enabled() else torch.linalg.vector_norm(u, dim=-1).square()
-        return self.log_variance.exp().unsqueeze(-1) * self.phi(d2)
-
     def diagonal(self, x: Tensor) -> Tensor:
         return self.log_variance.exp().expand(x.shape[:-1])
 
@@ -126,15 +118,6 @@ class StationaryKernel(Kernel):
         phi, psi = self.phi_psi(u.square().sum(-1))
         v = self.log_variance.exp().unsqueeze(-1)
         return v * phi, (v * psi).unsqueeze(-1) * (u * w)
-
-    def derivative_variance(self, x: Tensor) -> Tensor:
-        w = self.log_lengthscale.neg().exp()
-        return (w.square() * self.curvature().unsqueeze(-1)).expand(x.shape)
-
-    def curvature(self) -> Float[Tensor, "*batch"]:
-        """``v psi(0)``, the variance of a slope by a scaled input."""
-        v = self.log_variance.exp()
-        return v * self.phi_psi(torch.zeros_like(v))[1]
 
     def shift_invariant(self, in_features: int) -> list[bool]:
         return [True] * in_features

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import nn
@@ -12,13 +13,11 @@ from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..adam import Adam
 from ..kernels.kernel import is_shared
-from ..running_scale import write
-from . import plan as P
+from ..recent import Recent
 from .forgetting import ForgettingFactor, ProcessNoise
-from .monitor import DetectChanges, RobustWeight
-from .part import Host, Part, Sample
+from .monitor import RobustWeight
+from .part import Host, Part
 from .prequential_loss import PrequentialLoss, Queries
-from .replay import ReplayMemory
 
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
 # Adam's first step on parameters that are no logarithms: a deep kernel's weights
@@ -52,7 +51,7 @@ class LearnHyperparameters(Part):
         rate: Adam's first step on the logarithms of the hyperparameters.
         steps: gradient steps per rebuild, spread over the samples up to it; the last one starts where the
             others lead.
-        memory: samples of the past to learn from, too (ReplayMemory); 0: the last k only. Not with
+        memory: samples of the past to learn from, too (at least 32); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
 
     Raises:
@@ -76,56 +75,23 @@ class LearnHyperparameters(Part):
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
-        self.window_x = nn.Buffer(like.new_zeros(*fleet, self.window, like.shape[-1]))
-        self.window_y = nn.Buffer(like.new_zeros(*fleet, self.window, posterior.out_features))
-        self.window_on = nn.Buffer(like.new_zeros(*fleet, self.window))
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
         parameters = [*learner.kernel.hyperparameters().values(), learner.log_noise_variance]
         self.adam = Adam(parameters, betas=(0.9, 0.99))
         for i, p in enumerate(parameters):
             self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
-        horizon = math.inf if factor == 1.0 else 1.0 / (1.0 - factor)
-        if learner.part(DetectChanges) is not None:  # so that the new system's samples are let in at once
-            horizon = min(horizon, self.memory)
-        self.past = ReplayMemory(posterior, self.memory, horizon) if self.memory else None
-
-    def compiled(self) -> dict[int, Tensor | int]:
-        """Where compiled loops keep samples, see :mod:`.plan`."""
-        fields: dict[int, Tensor | int] = {
-            P.WINDOW_X: self.window_x, P.WINDOW_Y: self.window_y, P.WINDOW: self.window_on,
-            P.WINDOW_SIZE: self.window,
-        }  # fmt: skip
-        if self.past is not None:
-            fields |= {
-                P.PAST_X: self.past.x, P.PAST_Y: self.past.y, P.PAST: self.past.weight,
-                P.PAST_ABSORBED: self.past.absorbed, P.PAST_NUMBER: self.past.number,
-                P.PAST_SIZE: self.past.capacity,
-            }  # fmt: skip
-        return fields
-
-    def places(self, n: int, learner: Host) -> tuple[int, int]:
-        """Of the sample after n, in the window and the memory (-1: none)."""
-        place = (n - learner.refresh_offset) % self.window
-        return place, -1 if self.past is None else self.past.next_place()
-
-    def after_update(self, learner: Host, sample: Sample) -> bool:
-        """Keep the sample, in its own units; with a full window, descend."""
-        place = (learner.n_samples - learner.refresh_offset) % self.window
-        x, y, weight = sample.x, sample.y, sample.report.weight
-        weight = weight if sample.mask is None else weight * sample.mask
-        write(self.window_x, place, x)
-        write(self.window_y, place, y)
-        self.window_on.select(-1, place).copy_(weight)
-        if self.past is not None:
-            self.past.offer(x, y, weight)
-        self.act(learner)
-        return False
+        # no more than what a learner remembers that forgets
+        known = self.memory if factor == 1.0 else min(self.memory, math.ceil(1.0 / (1.0 - factor)))
+        size = max(self.window, known, learner.recent.capacity)
+        fleet = {"batch_shape": fleet, "dtype": like.dtype, "device": like.device}
+        learner.recent = Recent(learner.in_features, learner.out_features, size, **fleet)
+        self._n_rebuilt = 0
 
     def act(self, learner: Host) -> None:
-        """After the notes of a sample: descend, and move the parameters, when it is time."""
-        n = learner.n_samples
-        place, due = (n - learner.refresh_offset) % self.window, learner.is_due(n + 1)
+        """Descend, and move the parameters, when it is time."""
+        place = (learner.n_samples - learner.refresh_offset) % self.window
+        due = learner.is_due(learner.n_samples + 1)
         between = (place + 1) * self.steps // self.window > place * self.steps // self.window
         if due or (between and place + 1 < self.window):
             if moved := due and self.steps > 1:
@@ -135,36 +101,39 @@ class LearnHyperparameters(Part):
             self._move(learner)
 
     def after_rebuild(self, learner: Host) -> None:
-        """The present state becomes the past one; the window is empty."""
+        """The present state becomes the past one, which has seen all samples so far."""
         self.loss.snapshot(learner.posterior)
-        self.window_on.zero_()
-        if self.past is not None:
-            self.past.settle()
+        self._n_rebuilt = learner.n_samples
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
-        """These models face another system: what they kept does not count any more."""
-        self.window_on.masked_fill_(models.unsqueeze(-1), 0.0)
+        """These models face another system: the state of the old one does not count."""
         self.loss.state.forget(models)
-        if self.past is not None:
-            self.past.forget(models)
 
     def reset(self) -> None:
-        """Forget window, snapshot, memory and step sizes."""
+        """Forget snapshot and step sizes."""
         super().reset()
         self.adam.reset()
         self.loss.state.reset()
-        if self.past is not None:
-            self.past.reset()
+        self._n_rebuilt = 0
 
-    def queries(self, learner: Host) -> Queries:
-        """The window, and this turn's part of the memory, in the learner's units."""
-        x, y, weight = self.window_x, self.window_y, self.window_on
-        absorbed = age = x.new_zeros(self.window)
-        if self.past is not None:
-            n = max(_REPLAYED * self.window, learner.posterior.capacity)
-            x_past, y_past, weight_past, age_past = self.past.take(n)
+    def get_extra_state(self) -> dict[str, Any]:
+        """Samples that the past state has seen."""
+        return {"n_rebuilt": self._n_rebuilt}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._n_rebuilt = int(state["n_rebuilt"])
+
+    def queries(self, learner: Host, n: int) -> Queries:
+        """Of n samples those since the past state, and this turn's part of those that it has seen."""
+        recent = learner.recent
+        x, y, _, weight = recent.last(n, min(max(n - self._n_rebuilt, 0), self.window))
+        absorbed = age = x.new_zeros(x.shape[-2])
+        if self.memory:
+            k = max(_REPLAYED * self.window, learner.posterior.capacity)
+            x_past, y_past, weight_past, age_past = recent.take(n, k)
+            seen = (age_past > n - self._n_rebuilt).to(age_past.dtype)
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
-            weight = torch.cat([weight, weight_past], dim=-1)
+            weight = torch.cat([weight, weight_past * seen], dim=-1)
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
         return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
@@ -178,8 +147,9 @@ class LearnHyperparameters(Part):
         those of the past state are to be made again.
         """
         kernel, log_noise, parameters = learner.kernel, learner.log_noise_variance, self._theta(learner)
-        _, gradients = self.loss.with_gradients(kernel, log_noise, self.queries(learner), anew=moved)
-        on = (self.window_on.sum(-1) > 0).to(self.n_steps.dtype)
+        queries = self.queries(learner, learner.n_samples + 1)
+        _, gradients = self.loss.with_gradients(kernel, log_noise, queries, anew=moved)
+        on = ((queries.weight * (1.0 - queries.absorbed)).sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
         n = self.n_steps.clamp_min(1.0)
         correction, decay = self.adam.correction(n) * _shrink(n), _NETWORK_DECAY * _shrink(n)

@@ -10,13 +10,12 @@ from torch import nn
 from ..._checks import check_positive
 from ...typing import Float, Tensor
 from ..misled import Misled
-from . import plan as P
 from .part import Host, Part, Sample
 
 CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
 Z90_SQUARED = 1.6448536269514722**2
 RATE = 1 / 8  #: of the shares of samples that do not fit
-RING_SIZE = 24  # samples kept, of which those since the change are replayed
+RING_SIZE = 24  # samples of which those since the change are learned again
 ALARM, LARGE, _ONSET, COOL = 0.6, 5.0, 0.12, -2.0
 FACTOR_LEAST, FACTOR_MOST = -5.0, 10.0  # logarithms
 DISTRUSTED, DISTRUSTED_MOST = 0.25, 0.6  #: shares of distrusted samples
@@ -72,10 +71,6 @@ class CalibrateNoise(Part):
         """Factors c = 1 on the noise of all outputs."""
         self.log_factor = nn.Buffer(torch.zeros_like(learner.log_noise_variance))
 
-    def compiled(self) -> dict[int, Tensor]:
-        """Where compiled loops move c, see :mod:`.plan`."""
-        return {P.FACTOR: self.log_factor}
-
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Move c by whether this innovation lay outside of its interval."""
         noise = learner.log_noise_variance.exp()
@@ -106,45 +101,35 @@ class DetectChanges(Part):
     """
 
     def bind(self, learner: Host) -> None:
-        """Room for the last samples, one place for all models of a fleet."""
+        """Nothing was seen that does not fit."""
         zeros, fleet = learner.posterior.basis.new_zeros, learner.posterior.batch_shape
         self.level = nn.Buffer(zeros(fleet))
-        self.inputs = nn.Buffer(zeros(RING_SIZE, *fleet, learner.in_features))
-        self.targets = nn.Buffer(zeros(RING_SIZE, *fleet, learner.out_features))
         self.levels = nn.Buffer(zeros(RING_SIZE, *fleet))
         self.misled = Misled(fleet, self.level.dtype, self.level.device)
 
-    def compiled(self) -> dict[int, Tensor | int]:
-        """Where compiled loops keep samples, see :mod:`.plan`."""
-        return {
-            P.CHANGED: self.level, P.RING_X: self.inputs, P.RING_Y: self.targets, P.RING: self.levels,
-            P.MISLED: self.misled.level,
-        }  # fmt: skip
-
     def after_update(self, learner: Host, sample: Sample) -> bool:
-        """Take a sample in; models that face another system start again."""
-        place, mask = learner.n_samples % RING_SIZE, sample.mask
+        """Take note of how well a sample fits."""
+        mask = sample.mask
         large = (sample.report.nis > LARGE).to(self.level.dtype)
         self.level.lerp_(large, RATE) if mask is None else self.level.lerp_(large, RATE * mask)
         level = self.level if mask is None else self.level.where(mask > 0, math.inf)  # inf: no sample
-        for kept, value in ((self.inputs, sample.x), (self.targets, sample.y), (self.levels, level)):
-            kept.select(0, place).copy_(value)
-        self.misled.observe(sample.innovation, learner.units.targets(sample.y), mask)
-        self.act(learner)
+        self.levels.select(0, learner.n_samples % RING_SIZE).copy_(level)
+        self.misled.observe(sample.innovation, learner.units.output(sample.y), mask)
         return False
 
     def act(self, learner: Host) -> None:
         """Models that face another system, as the notes of the last sample have it, start again."""
-        place, misled = learner.n_samples % RING_SIZE, self.misled.found()
+        n, misled = learner.n_samples + 1, self.misled.found()
         changed = self.level > ALARM
         if misled is not None:
             changed = changed | misled
-            learner.units.forget(misled)
+            learner.units.output.forget(misled)
+            learner.recent.on.masked_fill_(misled.unsqueeze(-1), 0.0)
         if bool(changed.any()):
             self.level.masked_fill_(changed, COOL)
-            x, y, levels = (t.roll(-1 - place, 0) for t in (self.inputs, self.targets, self.levels))
+            x, y, levels = *learner.recent.last(n, RING_SIZE)[:2], self.levels.roll(-n, 0)
             later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
-            learner.start_anew(changed, x, y, later & levels.isfinite())
+            learner.start_anew(changed, x.movedim(-2, 0), y.movedim(-2, 0), later & levels.isfinite())
 
     def reset(self) -> None:
         """No sample was seen."""

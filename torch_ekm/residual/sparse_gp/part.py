@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import nn
@@ -13,85 +13,12 @@ from torch import nn
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
+from ..base import ResidualLearner
 from ..kernels.kernel import Kernel
-from ..kinds import DoubleStateLearner
+from ..recent import Recent
 from ..report import UpdateReport
-from ..running_scale import RunningScale
+from ..running_scale import Units
 from .posterior import SparsePosterior
-
-
-class Units:
-    """The units in which a learner works: those of x and y, or ``z = (x - shift) / scale``, and y the same.
-
-    Args:
-        input, output: scales of x and y; None: as they are.
-        centred: whether y has an offset, too.
-    """
-
-    def __init__(
-        self, input: RunningScale | None = None, output: RunningScale | None = None, *, centred: bool = False
-    ) -> None:
-        self.input, self.output, self._centred = input, output, centred
-
-    def inputs(self, x: Float[Tensor, "*any columns"]) -> Float[Tensor, "*any columns"]:
-        """x, or its first columns, in the learner's units."""
-        return x if self.input is None else self.input(x)
-
-    def targets(self, y: Float[Tensor, "*any out"]) -> Float[Tensor, "*any out"]:
-        """y ``(*any, out)`` in the learner's units."""
-        return y if self.output is None else self.output(y)
-
-    def of_sets(
-        self, x: Float[Tensor, "*batch n in"], y: Float[Tensor, "*batch n out"]
-    ) -> tuple[Tensor, Tensor]:
-        """n samples of each model in the learner's units."""
-        if self.input is None or self.output is None:
-            return x, y
-        return self.input.of_sets(x), self.output.of_sets(y)
-
-    def sets_as_given(self, z: Float[Tensor, "*batch n in"]) -> Float[Tensor, "*batch n in"]:
-        """Inputs in the learner's units back in their own."""
-        return (
-            z if self.input is None else z * self.input.scale.unsqueeze(-2) + self.input.shift.unsqueeze(-2)
-        )
-
-    def forget(self, models: Bool[Tensor, "*batch"]) -> None:
-        """The outputs' scales of these models are those of what comes."""
-        if self.output is not None:
-            self.output.forget(models)
-
-    def value(self, value: Float[Tensor, "*any out_or_1"], power: int) -> Tensor:
-        """An output in its own unit, or (power 2) a variance in its square."""
-        if self.output is None:
-            return value
-        if power == 1 and self._centred:
-            return value * self.output.scale + self.output.shift
-        return value * _power(self.output.scale, power)
-
-    def slope(
-        self, slope: Float[Tensor, "*any out_or_1 in"], power: int, z: Float[Tensor, "*any in"]
-    ) -> Float[Tensor, "*any out in"]:
-        """The derivative of such a value by x; z is that x in the learner's units."""
-        if self.input is None or self.output is None:
-            return slope
-        by = self.input.scale.unsqueeze(-2)
-        slope = slope * _power(self.output.scale, power).unsqueeze(-1) / by
-        return slope * self.input.follows(z).unsqueeze(-2) if self.input.cuts else slope
-
-    def affine(self) -> tuple[Tensor, ...]:
-        """Buffers (shift, scale) of x, then of y, for compiled loops, which change in place; or ``()``."""
-        if self.input is None or self.output is None:
-            return ()
-        return self.input.shift, self.input.scale, self.output.shift, self.output.scale
-
-    @property
-    def reach(self) -> Tensor | None:
-        """How far each column of z goes, ``(in,)``; None: without end."""
-        return None if self.input is None else self.input.reach
-
-
-def _power(scale: Tensor, power: int) -> Tensor:
-    return scale if power == 1 else scale.square()
 
 
 class Sample(NamedTuple):
@@ -100,19 +27,22 @@ class Sample(NamedTuple):
     x: Float[Tensor, "*batch in"]  #: in its own units
     y: Float[Tensor, "*batch out"]
     mask: Float[Tensor, "*batch"] | None  #: 1 where a model has a sample; None: all have
-    innovation: Float[Tensor, "*batch out"]  #: in the learner's units, as the latent variance
-    variance: Float[Tensor, "*batch"]
     report: UpdateReport
+    innovation: Float[Tensor, "*batch out"]  #: before it, in the learner's units, as the variance
+    variance: Float[Tensor, "*batch"]
 
 
-class Host(DoubleStateLearner):
-    """What a part finds in its learner: the state, and how it is forgotten and learned again."""
+class Host(ResidualLearner):
+    """What a part finds in its learner: the state, and how it is forgotten and learned again.
+
+    The state is always float64: a change of dtype is one of the interface only.
+    """
 
     kernel: Kernel
     log_noise_variance: Tensor
     posterior: SparsePosterior
     units: Units
-    engine: Any
+    recent: Recent
     refresh_every: int
     refresh_offset: int
     n_samples: int
@@ -121,6 +51,19 @@ class Host(DoubleStateLearner):
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
     weighing: tuple[Part, ...]
     """Parts that weigh samples."""
+
+    def _apply(self, fn, recurse=True):
+        def keep_double(tensor):
+            moved = fn(tensor)
+            if tensor is self._like or not tensor.is_floating_point():
+                return moved
+            return tensor.to(moved.device)
+
+        return super()._apply(keep_double, recurse)
+
+    @property
+    def _kept(self) -> torch.dtype:
+        return torch.float64
 
     @property
     @abstractmethod
@@ -138,6 +81,10 @@ class Host(DoubleStateLearner):
 
     parts: nn.ModuleList
     """All of them, in the order in which they act."""
+
+    @abstractmethod
+    def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
+        """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
 
     @abstractmethod
     def count_sample(self, *, anew: bool = False) -> None:
@@ -171,7 +118,7 @@ class Host(DoubleStateLearner):
         if x.shape[-2]:
             self.posterior.reset()
             for x_t, y_t, on_t in zip(x.unbind(-2), y.unbind(-2), on.unbind(-1), strict=True):
-                self.engine.absorb(self, x_t, y_t, on_t)
+                self.project(x_t, y_t, on_t)
             self.refresh()
 
     def start_anew(
@@ -183,11 +130,12 @@ class Host(DoubleStateLearner):
     ) -> None:
         """These models forget all but units, kernel and noise, and learn the samples ``used``."""
         self.posterior.forget(models)
+        self.recent.forget(models)
         for part in self._parts:
             part.forget(models)
         self.pending.masked_fill_(models, 0.0)
         for x_t, y_t, used_t in zip(x, y, used, strict=True):
-            self.engine.absorb(self, x_t, y_t, (used_t & models).to(x.dtype))
+            self.project(x_t, y_t, (used_t & models).to(x.dtype))
 
 
 class Part(Recorded, nn.Module):
@@ -199,7 +147,7 @@ class Part(Recorded, nn.Module):
 
     1. :meth:`before_update` with each sample before it is learned;
     2. :meth:`weigh` within an update, on the gain;
-    3. :meth:`after_update` after each sample;
+    3. :meth:`after_update` after each sample, then :meth:`act`;
     4. :meth:`on_rebuild` every ``refresh_every`` samples, before the caches are made again from the natural
        form, and :meth:`after_rebuild` thereafter.
 
@@ -224,6 +172,9 @@ class Part(Recorded, nn.Module):
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take note of a sample; True if the caches must be made again at once."""
         return False
+
+    def act(self, learner: Host) -> None:
+        """Do what the notes of a sample ask for, once all parts have taken theirs."""
 
     def on_rebuild(self, learner: Host) -> None:
         """Change the natural form before the caches are made from it."""

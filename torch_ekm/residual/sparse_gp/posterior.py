@@ -109,28 +109,6 @@ class SparsePosterior(nn.Module):
         diagonal = torch.where(self.active > 0, diagonal * (1.0 + self.jitter), 1.0)
         return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
-    def drift(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> float:
-        """How far the caches are from what :meth:`rebuild` would make, in O(b^2) (waits for a GPU).
-
-        The larger of two values. By how much the mean at the basis vectors, summed over the outputs,
-        is off, relative to its largest value: with ``W = Omega/s2`` exact coefficients have
-        ``alpha + W K alpha = h/s2``, and what is missing there, d, moves the mean by ``K (d + C K d)``. And
-        the largest entry of ``Q K_i - 1_i``, i the point that the others explain best: there Q_ii is
-        largest, and rounding shows first.
-        """
-        C, Q, W = self.moments.unbind(-3)
-        alpha, h = self.vectors.sum(-1, keepdim=True).unbind(-3)
-        K = self.gram(kernel)
-        f, s2 = K @ alpha, s2[..., None, None]
-        missing = (h - W @ f) / s2 - alpha
-        wrong = (K @ (missing + C @ (K @ missing))).abs().amax((-2, -1))
-        off = wrong / f.abs().amax((-2, -1)).clamp_min(torch.finfo(f.dtype).tiny)
-        i = Q.diagonal(dim1=-2, dim2=-1).argmax(-1)[..., None, None]
-        column = K.gather(-1, i.expand(*self.batch_shape, K.shape[-1], 1))
-        unit = self.slots.unsqueeze(-1).eq(i).to(K.dtype)
-        inverse = ((Q @ column - unit) * self.active.unsqueeze(-1)).abs().amax((-2, -1))
-        return float(torch.maximum(off, inverse).max())
-
     def rebuild(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> None:
         """alpha, C, Q from the natural form by Cholesky."""
         self.rebuild_from(self.gram(kernel), s2)

@@ -13,16 +13,15 @@ from ..kernels.kernel import Kernel, check_kernel, log_parameter
 from ..kernels.stationary import Matern32
 from ..predictions import joint_draws
 from ..printed import sparse_gp
+from ..recent import Recent
 from ..report import MomentsWithJacobians, UpdateReport
+from ..running_scale import BLOCK, RunningScale, Units
 from .defaults import chosen_parts
 from .engine.compiled import CompiledEngine
-from .engine.reference import ReferenceEngine
-from .part import Host, Part, Sample, Units
+from .engine.recursion import absorb
+from .part import Host, Part, Sample
 from .posterior import SparsePosterior
 from .units import Standardize
-
-_LATEST = 8  # rounds of ``refresh_every`` after which the caches are rebuilt in any case
-_DRIFT = 1e-8  # beyond which they are rebuilt at once, see SparsePosterior.drift
 
 
 class SparseOnlineGP(Host):
@@ -59,16 +58,13 @@ class SparseOnlineGP(Host):
         novelty_threshold: smallest ``gamma / k**`` of a new basis vector.
         parts: what it does apart from projecting samples; copied.
         standardize: whether it follows the stream's units, unless a part does; or how.
-        refresh_every: samples after which parts may change the state, and the caches are rebuilt. Without a
-            part that does, and on the CPU, one looks whether they have drifted (four times as often where
-            they do); they are rebuilt when they have, and at the latest after eight times as many.
+        refresh_every: samples after which parts may change the state, and the caches are rebuilt.
         refresh_offset: samples by which this comes later, for learners that are not to do it at the same one.
         options: see ResidualLearner.
 
     Attributes:
-        engine: what computes. Where numba is installed (extra ``fast``) compiled loops do updates and queries
-            of one sample per model, on the CPU in float64; they agree with torch to rounding. A
-            ``ReferenceEngine`` in its place uses torch alone.
+        engine: compiled loops for updates and queries of one sample per model, on the CPU in float64, where
+            numba is installed (extra ``fast``); they agree with torch to rounding. None: torch alone.
 
     Raises:
         ParameterError: a parameter is outside its range, or parts do not go together.
@@ -106,24 +102,22 @@ class SparseOnlineGP(Host):
         self.posterior = SparsePosterior(*sizes, novelty_threshold=novelty_threshold, **fleet)
         # samples of each model since the caches were made
         self.pending = nn.Buffer(torch.zeros(shape, **double))
-        self.engine: ReferenceEngine = CompiledEngine()
-        self.drifts = False  # the last look at the caches found them less exact than rounding would have it
+        self.engine: CompiledEngine | None = CompiledEngine()
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
-        self._parts, self.units = (), Units()
+        self.units = Units(*(RunningScale(size, **fleet) for size in sizes[:2]))
+        self.recent, self._parts = Recent(*sizes[:2], BLOCK, **fleet, dtype=torch.float64), ()
         for part in chosen_parts(parts, standardize):
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
-        self.weighing = _overriding(self._parts, "weigh")
-        self._noting = _overriding(self._parts, "after_update")
-        self._rebuilding = _overriding(self._parts, "on_rebuild", "after_rebuild")
-        self._preparing = _overriding(self._parts, "before_update")
+        self.weighing = tuple(part for part in self._parts if type(part).weigh is not Part.weigh)
 
     # -- predictions ----------------------------------------------------------------------------
 
     def forward(self, x: Tensor) -> Tensor:
         """Posterior mean ``alpha' k(X, x)`` in the outputs' units, differentiable in x."""
-        return self.engine.mean(self, x)
+        found = self._ask(x)
+        return self._mean(self._cross(self._inputs(x))) if found is None else found.mean
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """N(mean, var), with the observation noise added on request."""
@@ -131,25 +125,40 @@ class SparseOnlineGP(Host):
         return Normal(mean, variance.sqrt(), validate_args=False)
 
     def moments(self, x: Tensor, *, observation: bool = False) -> tuple[Tensor, Tensor]:
-        """Mean and variance, with the observation noise on request."""
-        return self.engine.observed(self, x) if observation else self.engine.moments(self, x)
-
-    def both_moments(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, latent variance, and the same with the observation noise."""
-        mean, variance = self.engine.moments(self, x)
-        return mean, variance, variance + self.noise_variance.to(self.dtype)
+        """Mean and variance ``k** + k'Ck``, with the observation noise on request."""
+        found = self._ask(x, variance=True, noisy=observation)
+        if found is not None:
+            return found[:2]
+        z = self._inputs(x)
+        k = self._cross(z)
+        column = k.unsqueeze(-1)
+        kCk = (column.mT @ (self.posterior.covariance @ column)).squeeze(-1).squeeze(-1)
+        variance = self._out((self.kernel.diagonal(z) + kCk).clamp_min(0.0).unsqueeze(-1), 2)
+        return self._mean(k), variance + self.noise_variance.to(self.dtype) if observation else variance
 
     def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and its derivative, ``(alpha'k, alpha' dk/dx)``, in closed form."""
-        return self.engine.linearize(self, x)
+        found = self._ask(x, slopes=True)
+        if found is not None:
+            return found.mean, found.mean_jacobian
+        z = self._inputs(x)
+        # free slots need no mask here: their rows in alpha and C are 0
+        k, dk = self.kernel.with_gradient(z, self.posterior.basis)
+        alpha = self.posterior.alpha.mT
+        mean = self._out((alpha @ k.unsqueeze(-1)).squeeze(-1), 1)
+        return self.bounded_slope(mean, self._out_slope(alpha @ dk, 1, z))
 
     def slope_deviation(self, x: Tensor) -> Tensor:
         """Root of ``d2k(x, z)/dx dz + (dk/dx)' C dk/dx`` at ``z = x``, by column."""
-        return self.engine.slope_deviation(self, x)
+        z = self._inputs(x)
+        _, dk = self.kernel.with_gradient(z, self.posterior.basis)
+        v = self.kernel.derivative_variance(z) + (dk * (self.posterior.covariance @ dk)).sum(-2)
+        # where z is cut g is flat, but what is known of it does not grow
+        return self._out_slope(v.clamp_min(0.0).sqrt().unsqueeze(-2), 1, torch.zeros_like(z))
 
     def unit_draws(self, x: Tensor, n: int, generator: torch.Generator | None) -> Tensor:
         """From the covariance ``K(x, x') + k' C k'`` of the queries."""
-        z = self.units.inputs(x).reshape(-1, *self.batch_shape, self.in_features).movedim(0, -2)
+        z = self.units.input(x).reshape(-1, *self.batch_shape, self.in_features).movedim(0, -2)
         k = self.kernel(z, self.posterior.basis) * self.posterior.active.unsqueeze(-2)
         covariance = self.kernel(z, z) + k @ self.posterior.covariance @ k.mT
         draws = joint_draws(covariance, n, self.out_features, generator)
@@ -162,7 +171,45 @@ class SparseOnlineGP(Host):
         d mean/dx = alpha' dk/dx,   d var/dx = dk(x,x)/dx + 2 (Ck)' dk/dx
         ```
         """
-        return self.engine.jacobians(self, x)
+        found = self._ask(x, variance=True, slopes=True)
+        if found is not None:
+            return found
+        z = self._inputs(x)
+        k, dk = self.kernel.with_gradient(z, self.posterior.basis)
+        column, alpha = k.unsqueeze(-1), self.posterior.alpha
+        Ck = self.posterior.covariance @ column
+        # alpha and Ck side by side share one pass over k and one over dk
+        left = torch.cat([alpha.expand(*Ck.shape[:-1], alpha.shape[-1]), Ck], dim=-1).mT
+        values, slopes = (left @ column).squeeze(-1), left @ dk
+        v = (self.kernel.diagonal(z) + values[..., -1]).clamp_min(0.0).unsqueeze(-1)
+        dv = self.kernel.diagonal_gradient(z).unsqueeze(-2) + 2.0 * slopes[..., -1:, :]
+        jacobian = self._out_slope(slopes[..., :-1, :], 1, z)
+        mean, jacobian = self.bounded_slope(self._out(values[..., :-1], 1), jacobian)
+        return MomentsWithJacobians(mean, self._out(v, 2), jacobian, self._out_slope(dv, 2, z))
+
+    def _ask(self, x: Tensor, **wanted: bool) -> MomentsWithJacobians | None:
+        """What compiled loops say; None: torch must do it."""
+        return None if self.engine is None else self.engine.ask(self, x, **wanted)
+
+    def _inputs(self, x: Tensor) -> Tensor:
+        return self.units.input(self.check_query(x))
+
+    def _cross(self, z: Tensor) -> Tensor:
+        """k(X, z) of the slots in use."""
+        return self.kernel.vector(z, self.posterior.basis) * self.posterior.active
+
+    def _mean(self, k: Tensor) -> Tensor:
+        return self.bounded(self._out((k.unsqueeze(-2) @ self.posterior.alpha).squeeze(-2), 1))
+
+    def _out(self, value: Tensor, power: int) -> Tensor:
+        """``(*any, out or 1)`` in output units (squared if power is 2), in the interface's dtype."""
+        value = self.units.value(value, power)
+        return value.expand(*value.shape[:-1], self.out_features).to(self.dtype)
+
+    def _out_slope(self, slope: Tensor, power: int, z: Tensor) -> Tensor:
+        """Derivative by x of what is ``(*any, out or 1)`` in the learner's units."""
+        slope = self.units.slope(slope, power, z)
+        return slope.expand(*slope.shape[:-2], self.out_features, slope.shape[-1]).to(self.dtype)
 
     # -- what is known --------------------------------------------------------------------------
 
@@ -177,7 +224,8 @@ class SparseOnlineGP(Host):
     @property
     def basis_inputs(self) -> Float[Tensor, "*batch slots in"]:
         """Basis points in the inputs' own units; only slots with ``posterior.active == 1`` count."""
-        return self.units.sets_as_given(self.posterior.basis).to(self.dtype)
+        scale, shift = self.units.input.scale, self.units.input.shift
+        return (self.posterior.basis * scale.unsqueeze(-2) + shift.unsqueeze(-2)).to(self.dtype)
 
     def __repr__(self) -> str:
         return "\n  ".join([f"{type(self).__name__}({self.extra_repr()})", *sparse_gp(self)])
@@ -187,67 +235,51 @@ class SparseOnlineGP(Host):
     def reset(self) -> None:
         """Forget all samples and units; kernel and noise stay."""
         self.posterior.reset()
+        self.units.reset()
+        self.recent.reset()
         for part in self._parts:
             part.reset()
         for count in (self.pending, self.n_refused, self.largest):
             count.zero_()
-        self.n_samples, self.drifts = 0, False
+        self.n_samples = 0
 
-    def update(self, x: Tensor, y: Tensor, mask: Tensor | None = None) -> UpdateReport:
-        """See :meth:`ResidualLearner.update`; single samples that the engine accepts skip its checks."""
-        if mask is None:
-            with self.lock:
-                report = self.engine.learn(self, x, y, None)
-                if report is not None:
-                    return report
-        return super().update(x, y, mask)
+    def at_once(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        return None if self.engine is None else self.engine.learn(self, x, y, mask)
 
     @torch.no_grad()
     def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        report = self.engine.learn(self, x, y, mask)
-        if report is not None:
-            return report
         on = None if mask is None else mask.to(x.dtype)
-        for part in self._preparing:
+        self.recent.keep(self.n_samples, x, y, on)
+        for part in self._parts:
             part.before_update(self, x, y, on)
-        done = self.engine.absorb(self, x, y, on)
-        anew = False
-        if self._noting:
-            sample = Sample(x, y, on, done.innovation, done.variance, done.report)
-            for part in self._noting:
-                anew |= part.after_update(self, sample)
+        sample, anew = Sample(x, y, on, *self.project(x, y, on)), False
+        self.recent.weigh(self.n_samples, sample.report.weight)
+        for part in self._parts:
+            anew |= part.after_update(self, sample)
         self.pending.add_(1.0 if on is None else on)  # += would register the buffer again
+        for part in self._parts:
+            part.act(self)
         self.count_sample(anew=anew)
-        return done.report
+        return sample.report
+
+    def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
+        """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
+        done = None if self.engine is None else self.engine.project(self, x, y, on)
+        if done is not None:
+            return done
+        z, t = self.units.input(x), self.units.output(y)
+        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
 
     def count_sample(self, *, anew: bool = False) -> None:
         """After a sample and all notes of it: rebuild the caches when it is time, or at once."""
         n = self.n_samples + 1
-        if self._rebuilding or self.device.type != "cpu":  # on a GPU looking would mean waiting
-            anew |= self.is_due(n)
-        else:
-            every = max(self.refresh_every // 4, 1) if self.drifts else self.refresh_every
-            anew |= n % every == 0 and self._is_stale(n)
         vars(self)["n_samples"] = n  # an assignment to a Module takes ten times as long
-        if anew:
+        if anew or self.is_due(n):
             self.refresh()
-
-    def _is_stale(self, n: int) -> bool:
-        """Whether the caches must be made again after n samples although no part changed the state."""
-        if n % (_LATEST * self.refresh_every) == 0:
-            return True
-        drift = self.posterior.drift(self.kernel, self.shared_noise())
-        self.drifts = drift > 0.01 * _DRIFT
-        return drift > _DRIFT
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
-        return {**super().get_extra_state(), "n_samples": self.n_samples, "drifts": self.drifts}
+        return {**super().get_extra_state(), "n_samples": self.n_samples}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.n_samples, self.drifts = int(state["n_samples"]), bool(state["drifts"])
-
-
-def _overriding(parts: Iterable[Part], *names: str) -> tuple[Part, ...]:
-    """Those of the parts that do something of their own in one of these methods."""
-    return tuple(p for p in parts if any(getattr(type(p), name) is not getattr(Part, name) for name in names))
+        self.n_samples = int(state["n_samples"])

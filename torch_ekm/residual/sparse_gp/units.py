@@ -1,16 +1,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
 from ..._checks import check_sizes
 from ...exceptions import ParameterError
 from ...typing import Tensor
-from ..running_scale import ALIEN, BLOCK, RunningScale
-from . import plan as P
-from .part import Host, Part, Units
+from ..running_scale import ALIEN, BLOCK, RunningScale, Units
+from .part import Host, Part
 
 _DOUBLING = 1024  # samples up to which units are adopted after 1, 2, 4, 8, ... samples, too
 
@@ -50,60 +49,63 @@ class Standardize(Part):
         self.input_resolution, self.output_scale = input_resolution, output_scale
 
     def bind(self, learner: Host) -> None:
-        """Running moments of x and y, 0 and 1 at the start."""
-        like = learner.posterior.basis
-        fleet = {"batch_shape": learner.posterior.batch_shape, "dtype": like.dtype, "device": like.device}
-        shifted = learner.kernel.shift_invariant(learner.in_features)
-        centred = [self.output_offset == "learned"] * learner.out_features
-        grows = learner.kernel.grows(learner.in_features)
-        resolution = check_sizes("input_resolution", self.input_resolution, learner.in_features)
-        least = check_sizes("output_scale", self.output_scale, learner.out_features)
-        self.input = RunningScale(learner.in_features, shifted, grows, resolution, **fleet)
-        self.output = RunningScale(learner.out_features, centred, least=least, **fleet)
-        learner.units = Units(self.input, self.output, centred=self.output_offset == "learned")
+        """The learner's units are those that were asked for."""
+        d, m, like = learner.in_features, learner.out_features, learner.posterior.basis
+        fleet = {"batch_shape": learner.batch_shape, "dtype": like.dtype, "device": like.device}
+        learner.units = self.units(d, m, learner.kernel.shift_invariant(d), learner.kernel.grows(d), **fleet)
 
-    def compiled(self) -> dict[int, Tensor | int]:
-        """Where compiled loops keep samples, see :mod:`.plan`."""
-        x, y = self.input, self.output
-        return {
-            P.BLOCK: x.block, P.BLOCK_ON: x.block_on, P.BLOCK_Y: y.block, P.BLOCK_ON_Y: y.block_on,
-            P.BLOCK_SIZE: BLOCK,
-        }  # fmt: skip
+    def units(
+        self, in_features: int, out_features: int, shifted: list[bool], grows: list[bool], **options: Any
+    ) -> Units:
+        """0 and 1 at first; of columns of x that are centred, and that are cut, see RunningScale."""
+        centred = [self.output_offset == "learned"] * out_features
+        resolution = check_sizes("input_resolution", self.input_resolution, in_features)
+        least = check_sizes("output_scale", self.output_scale, out_features)
+        return Units(
+            RunningScale(in_features, shifted, grows, resolution, **options),
+            RunningScale(out_features, centred, least=least, **options),
+        )
 
-    def place(self, n: int, learner: Host) -> int:
-        """Of the sample after n in the block, which is full just before a rebuild."""
-        return n if n < BLOCK else (n - learner.refresh_offset) % BLOCK
-
-    def acts_before(self, n: int, learner: Host) -> bool:
-        """Whether it does more before the sample after n than keep it."""
-        return n == BLOCK or self.place(n, learner) == BLOCK - 1 or (n & (n + 1) == 0 and n < _DOUBLING)
+    def is_rough(self, learner: Host) -> bool:
+        """Whether units are adopted before the present sample is learned."""
+        n = learner.n_samples
+        return n & (n + 1) == 0 and n < _DOUBLING
 
     def before_update(self, learner: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
-        """Take the sample in; while units are rough, adopt them before it is learned."""
+        """While units are rough, adopt them before a sample is learned, which counts."""
         n = learner.n_samples
-        place = self.place(n, learner)
-        if n == BLOCK and place > 0:  # what is behind was pooled already
-            self.input.block_on.zero_()
-            self.output.block_on.zero_()
-        self.input.observe(place, x, mask)
-        self.output.observe(place, y, mask)
-        if n & (n + 1) == 0 and n < _DOUBLING:
-            if n + 1 < BLOCK:
-                self._adopt(learner, young=True)
-                x, y, on = self.input.block, self.output.block, self.input.block_on
-                learner.learn_anew(x[..., :n, :], y[..., :n, :], on[..., :n, 0])
-            elif not learner.is_due(n + 1):  # else it comes of itself
-                learner.refresh()
+        if not self.is_rough(learner):
+            return
+        if n + 1 < BLOCK:
+            x, y, on, _ = learner.recent.last(n + 1, n + 1)
+            self._adopt(learner, x, y, on)
+            learner.learn_anew(x[..., :n, :], y[..., :n, :], on[..., :n])
+            return
+        self._pool(learner)
+        if not learner.is_due(n + 1):  # else it comes of itself
+            learner.refresh()
+
+    def act(self, learner: Host) -> None:
+        """Pool a block that is full."""
+        if not self.is_rough(learner):
+            self._pool(learner)
 
     def on_rebuild(self, learner: Host) -> None:
         """Adopt the moments: ``new z = (old z + offset) ratio``, ``new t = (old t + offset_t) ratio_t``."""
         if learner.n_samples >= BLOCK - 1:
             self._adopt(learner)
 
-    def _adopt(self, learner: Host, young: bool = False) -> None:
-        posterior = learner.posterior
-        offset, ratio = self.input.settle(young=young)
-        offset_t, ratio_t = self.output.settle(young=young)
+    def _pool(self, learner: Host) -> None:
+        """Blocks end with the 32nd sample, and just before each rebuild from then on."""
+        n, offset = learner.n_samples + 1, learner.refresh_offset % BLOCK
+        if n == BLOCK or (n > BLOCK and (n - offset) % BLOCK == 0):
+            size = offset if offset and n == BLOCK + offset else BLOCK
+            learner.units.pool(*learner.recent.last(n, size)[:3])
+
+    def _adopt(self, learner: Host, *young: Tensor) -> None:
+        posterior, units = learner.posterior, learner.units
+        offset, ratio = units.input.settle(*young[::2])
+        offset_t, ratio_t = units.output.settle(*young[1:])
         alien = (torch.cat([ratio, ratio_t], dim=-1) > 1.0 / ALIEN).any(-1)
         if alien.is_cuda or bool(alien.any()):  # what is of another size would stay for good
             posterior.forget(alien)
@@ -111,8 +113,3 @@ class Standardize(Part):
         if self.output_offset == "learned":
             posterior.information.add_(posterior.precision.sum(-1, keepdim=True) * offset_t.unsqueeze(-2))
         posterior.information.mul_(ratio_t.unsqueeze(-2))
-
-    def reset(self) -> None:
-        """Back to z = x, t = y."""
-        self.input.reset()
-        self.output.reset()

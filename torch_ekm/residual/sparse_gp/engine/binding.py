@@ -21,10 +21,10 @@ from ...kernels.stationary import Matern32, SquaredExponential
 from .. import plan as P
 from ..forgetting import ForgettingFactor, ProcessNoise
 from ..hyperparameters import LearnHyperparameters
-from ..monitor import RING_SIZE, CalibrateNoise, DetectChanges, RobustWeight
+from ..monitor import CalibrateNoise, DetectChanges, RobustWeight
 from ..part import Host, Part
-from ..replay import ReplayMemory
 from ..units import Standardize
+from .loading import load_loops
 
 _PARTS = (
     Standardize, RobustWeight, DetectChanges, CalibrateNoise, LearnHyperparameters, ForgettingFactor,
@@ -78,14 +78,10 @@ class Plan(Bound):
 
     def __init__(self, gp: Host) -> None:
         super().__init__()
-        self.kernel = gp.kernel
         self.units, self.changes = gp.part(Standardize), gp.part(DetectChanges)
         self.learning = gp.part(LearnHyperparameters)
-        self.past: ReplayMemory | None = None if self.learning is None else self.learning.past
-        self.others = tuple(p for p in gp.parts if type(p) in (CalibrateNoise, LearnHyperparameters))
         self.shape = tuple(gp.batch_shape)
         self.one, self.two = (*self.shape, gp.out_features), (*self.shape, gp.out_features, gp.in_features)
-        self.ring = RING_SIZE if self.changes else 1
         self.all = np.ones(math.prod(self.shape), np.bool_)
         fields = self._fields(gp)
         tensors = [value for value in fields.values() if isinstance(value, Tensor)]
@@ -97,59 +93,63 @@ class Plan(Bound):
             return
         for field, value in fields.items():
             self.row[field] = value.data_ptr() if isinstance(value, Tensor) else value
-        self._embedded: Tensor | None = None
+        widths = [gp.in_features]
         if isinstance(gp.kernel, DeepKernel):
-            self._bind_network(gp.kernel, gp.posterior.basis)
+            *hidden, last = gp.kernel.weights
+            layers = [p for pair in zip(hidden, gp.kernel.biases, strict=True) for p in pair] + [last, last]
+            widths += [weight.shape[-1] for weight in gp.kernel.weights]
+            self.row[P.LAYERS], self.row[P.WIDTHS] = len(widths) - 1, self.own(np.array(widths))
+            self.row[P.WEIGHTS] = self.own(np.array([p.data_ptr() for p in layers]))
+        width = widths[0] + (widths[-1] if len(widths) > 1 else 0)
+        self.row[P.WIDTH], self.row[P.VALUES] = width, sum(widths)
+        self.row[P.EMBEDDED] = self.own(np.empty((len(self.all), gp.posterior.capacity + 1, width)))
+        self._basis, self._marks = gp.posterior.basis, [-1]
 
     def _fields(self, gp: Host) -> dict[int, Any]:
-        d, m, n = gp.in_features, gp.out_features, math.prod(self.shape)
-        posterior, units, kernel = gp.posterior, gp.units, _known(gp.kernel)
+        posterior, recent, x, y = gp.posterior, gp.recent, gp.units.input, gp.units.output
+        robust, calibrated = gp.part(RobustWeight), gp.part(CalibrateNoise)
+        threshold = 0.0 if robust is None else robust.threshold**2
         fields: dict[int, Any] = {
-            P.MODELS: n, P.SLOTS: posterior.capacity + 1, P.IN: d, P.OUT: m, P.WIDTH: d,
-            P.OWN_UNITS: int(bool(units.affine())),
+            P.MODELS: len(self.all), P.SLOTS: posterior.capacity + 1,
+            P.IN: gp.in_features, P.OUT: gp.out_features,
+            P.FIGURES: self.own(np.array([posterior.novelty_threshold, posterior.jitter, threshold])),
             P.BASIS: posterior.basis, P.ACTIVE: posterior.active, P.COUNT: posterior.count,
             P.SLOT: posterior.slot, P.MOMENTS: posterior.moments, P.VECTORS: posterior.vectors,
             P.PENDING: gp.pending, P.LARGEST: gp.largest, P.LOG_NOISE: gp.log_noise_variance,
+            P.SHIFT: x.shift, P.SCALE: x.scale, P.SHIFT_Y: y.shift, P.SCALE_Y: y.scale, P.REACH: x.reach,
+            P.RECENT_X: recent.x, P.RECENT_Y: recent.y, P.RECENT_ON: recent.on, P.RECENT: recent.weight,
+            P.RECENT_SIZE: recent.capacity,
+            **(_known(gp.kernel) or {}),
         }  # fmt: skip
-        if kernel is not None:
-            fields |= kernel
-        if units.affine():
-            fields |= dict(zip((P.SHIFT, P.SCALE, P.SHIFT_Y, P.SCALE_Y), units.affine(), strict=True))
-            fields[P.REACH] = units.reach
-        else:
-            plain = {P.SHIFT: (d, 0.0), P.SCALE: (d, 1.0), P.SHIFT_Y: (m, 0.0), P.SCALE_Y: (m, 1.0)}
-            for field, (size, value) in {**plain, P.REACH: (d, np.inf)}.items():
-                fields[field] = self.own(np.full(size, value))
-        robust = gp.part(RobustWeight)
-        threshold = 0.0 if robust is None else robust.threshold**2
-        fields[P.FIGURES] = self.own(np.array([posterior.novelty_threshold, posterior.jitter, threshold]))
         if robust is not None:
             fields[P.DISTRUSTED] = robust.level
-        for part in (self.units, gp.part(CalibrateNoise), self.changes, self.learning):
-            if part is not None:
-                fields |= part.compiled()
+        if calibrated is not None:
+            fields[P.FACTOR] = calibrated.log_factor
+        if self.changes is not None:
+            level, misled = self.changes.level, self.changes.misled.level
+            fields |= {P.CHANGED: level, P.LEVELS: self.changes.levels, P.MISLED: misled}
         return fields
 
-    def _bind_network(self, kernel: DeepKernel, basis: Tensor) -> None:
-        """Room for the basis as the network makes it, and where its weights are."""
-        *hidden, last = kernel.weights
-        layers = [p for pair in zip(hidden, kernel.biases, strict=True) for p in pair] + [last, last]
-        widths = [basis.shape[-1], *(weight.shape[-1] for weight in kernel.weights)]
-        self._embedded = basis.new_empty(*basis.shape[:-1], widths[0] + widths[-1])
-        row, addresses = self.row, [p.data_ptr() for p in layers]
-        row[P.LAYERS], row[P.WIDTH] = len(widths) - 1, widths[0] + widths[-1]
-        row[P.WIDTHS], row[P.WEIGHTS] = self.own(np.array(widths)), self.own(np.array(addresses))
-        row[P.EMBEDDED], self._basis = self._embedded.data_ptr(), basis
-        self._marks: list[int] = []
+    def is_rough(self, gp: Host) -> bool:
+        """Whether a part changes the state before the present sample is learned."""
+        return self.units is not None and self.units.is_rough(gp)
+
+    def act(self, gp: Host, alarm: bool) -> None:
+        """What is due after the notes of a sample."""
+        if self.units is not None:
+            self.units.act(gp)
+        if alarm and self.changes is not None:
+            self.changes.act(gp)
+        if self.learning is not None:
+            self.learning.act(gp)
+        gp.count_sample()
 
     def follow(self) -> None:
-        """Embed the basis again where torch changed it, or the network: loops leave no mark on a tensor."""
-        if self._embedded is None:
-            return
+        """Embed the basis again where torch changed it, or the kernel: loops leave no mark on a tensor."""
         marks = [t._version for t in (self._basis, *self.parameters)]
         if marks != self._marks:
-            with torch.no_grad():
-                self._embedded.copy_(self.kernel.embed(self._basis))  # type: ignore[operator]
+            loops: Any = load_loops()
+            loops.embed_fleet(self.row)
             self._marks = marks
 
 
@@ -157,7 +157,7 @@ def _reason(gp: Host, tensors: list[Tensor]) -> str:
     """Why compiled loops do not know this learner; empty: they do."""
     if _known(gp.kernel) is None:
         return f"they do not know its kernel, {type(gp.kernel).__name__}"
-    hooks = [getattr(Part, name) for name in ("before_update", "weigh", "after_update", "noise")]
+    hooks = [getattr(Part, name) for name in ("before_update", "weigh", "after_update", "act", "noise")]
     for part in gp.parts:
         own = [getattr(type(part), hook.__name__) for hook in hooks]
         if type(part) not in _PARTS and own != hooks:

@@ -13,17 +13,14 @@ from ...._warnings import warn
 from ....exceptions import SpeedWarning
 from ....typing import Tensor
 from ...report import MomentsWithJacobians, UpdateReport
-from .. import plan as P
-from ..part import Host, Sample
+from ..part import Host
 from .binding import Bound, Plan
 from .loading import load_loops
-from .recursion import Absorbed
-from .reference import ReferenceEngine
 
 _LEFT = "{} learns by torch, which takes several times as long as compiled loops: {}"
 
 
-class CompiledEngine(ReferenceEngine):
+class CompiledEngine:
     """Updates and queries of one sample per model by compiled loops, on the learner's own memory.
 
     Torch does the work without numba, on another device, in float32, where a gradient is to be carried,
@@ -41,29 +38,9 @@ class CompiledEngine(ReferenceEngine):
     def __reduce__(self) -> tuple[Any, ...]:
         return CompiledEngine, ()
 
-    # -- queries --------------------------------------------------------------------------------
+    # -- calls ----------------------------------------------------------------------------------
 
-    def mean(self, gp: Host, x: Tensor) -> Tensor:
-        found = self._ask(gp, x)
-        return super().mean(gp, x) if found is None else found.mean
-
-    def moments(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
-        found = self._ask(gp, x, variance=True)
-        return super().moments(gp, x) if found is None else found[:2]
-
-    def observed(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
-        found = self._ask(gp, x, variance=True, noisy=True)
-        return super().observed(gp, x) if found is None else found[:2]
-
-    def linearize(self, gp: Host, x: Tensor) -> tuple[Tensor, Tensor]:
-        found = self._ask(gp, x, slopes=True)
-        return super().linearize(gp, x) if found is None else (found.mean, found.mean_jacobian)
-
-    def jacobians(self, gp: Host, x: Tensor) -> MomentsWithJacobians:
-        found = self._ask(gp, x, variance=True, slopes=True)
-        return super().jacobians(gp, x) if found is None else found
-
-    def _ask(
+    def ask(
         self, gp: Host, x: Tensor, *, variance: bool = False, slopes: bool = False, noisy: bool = False
     ) -> MomentsWithJacobians | None:
         """One query per model, what is not wanted being empty; None: torch must do it."""
@@ -78,77 +55,42 @@ class CompiledEngine(ReferenceEngine):
         loops.query_fleet(plan.row, noisy, *addresses)
         return MomentsWithJacobians(mean, v, J, dv)
 
-    # -- updates --------------------------------------------------------------------------------
-
-    @torch.no_grad()
     def learn(self, gp: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
+        """All that an update does; None: not one good sample for each model, or torch must do it."""
         plan = self.plan(gp, x)
-        if plan is None or not is_plain_one(y, plan.one):
+        if plan is None or not is_plain_one(y, plan.one) or plan.is_rough(gp):
             return None
-        x, y = x.contiguous(), y.contiguous()
-        loops: Any = load_loops()
-        if not loops.are_finite(plan.row, x.data_ptr(), y.data_ptr()):
+        (report, *_), alarm = self._update(plan, gp.n_samples, x, y, mask)
+        if alarm < 0:
             return None
-        turn = self.begin(gp, x, y, mask)
-        *found, alarm = self._update(plan, turn, x, y, mask)
-        self.finish(gp, x, y, mask, alarm, *found)
-        return as_absorbed(plan, *found).report
+        plan.act(gp, bool(alarm))
+        return report
 
-    def absorb(self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None) -> Absorbed:
+    def project(
+        self, gp: Host, x: Tensor, y: Tensor, on: Tensor | None
+    ) -> tuple[UpdateReport, Tensor, Tensor] | None:
+        """See ``Host.project``; None: torch must do it."""
         plan = self.plan(gp, x)
         if plan is None or not is_plain_one(y, plan.one):
-            return super().absorb(gp, x, y, on)
-        x, y, turn = x.contiguous(), y.contiguous(), (P.LEARN, -1, -1, -1, -1, 0)
-        return as_absorbed(plan, *self._update(plan, turn, x, y, None if on is None else on > 0)[:3])
+            return None
+        done, alarm = self._update(plan, -1, x, y, None if on is None else on > 0)
+        return done if alarm >= 0 else None
 
     def _update(
-        self, plan: Plan, turn: tuple[int, ...], x: Tensor, y: Tensor, mask: Tensor | None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+        self, plan: Plan, n: int, x: Tensor, y: Tensor, mask: Tensor | None
+    ) -> tuple[tuple[UpdateReport, Tensor, Tensor], int]:
+        x, y = x.contiguous(), y.contiguous()
         figures, event = np.zeros((4, len(plan.all))), np.zeros(len(plan.all), np.int64)
         if mask is not None:
             figures[2] = 1.0
         errors = np.zeros((len(plan.all), plan.one[-1]))
         loops: Any = load_loops()
         alarm = loops.update_fleet(
-            plan.row, np.array(turn), on_array(plan, mask), x.data_ptr(), y.data_ptr(), figures, event, errors
+            plan.row, n, on_array(plan, mask), x.data_ptr(), y.data_ptr(), figures, event, errors
         )
-        return figures, event, errors, alarm
-
-    def begin(self, gp: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> tuple[int, ...]:
-        """What the parts do before a sample is learned, and the places to which loops write it."""
-        plan, n = self._plan, gp.n_samples
-        assert plan is not None
-        block = window = past = -1
-        if plan.units is not None:
-            if plan.units.acts_before(n, gp):
-                plan.units.before_update(gp, x, y, None if mask is None else mask.to(x.dtype))
-                plan.follow()
-            else:
-                block = plan.units.place(n, gp)
-        if plan.learning is not None:
-            window, past = plan.learning.places(n, gp)
-        return P.NOTE, block, n % plan.ring, window, past, n
-
-    def finish(
-        self, gp: Host, x: Tensor, y: Tensor, mask: Tensor | None, alarm: bool, *found: np.ndarray
-    ) -> None:
-        """What the parts do after it, given what loops found of it."""
-        plan = self._plan
-        assert plan is not None
-        if alarm:
-            assert plan.changes is not None
-            on = None if mask is None else mask.to(x.dtype)
-            plan.changes.act(gp)
-            done = as_absorbed(plan, *found)
-            sample = Sample(x, y, on, done.innovation, done.variance, done.report)
-            for part in plan.others:
-                part.after_update(gp, sample)  # type: ignore[operator]
-            gp.pending.add_(1.0 if on is None else on)
-        elif plan.learning is not None:
-            if plan.past is not None:
-                plan.past.count()
-            plan.learning.act(gp)
-        gp.count_sample()
+        novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *plan.shape)).unbind()
+        report = UpdateReport(torch.from_numpy(event.reshape(plan.shape)), novelty, nis, weight)
+        return (report, torch.from_numpy(errors.reshape(plan.one)), variance), alarm
 
     # -- what they work on ----------------------------------------------------------------------
 
@@ -187,10 +129,3 @@ def is_plain_one(x: Any, shape: tuple[int, ...]) -> bool:
 def on_array(plan: Bound, mask: Tensor | None) -> np.ndarray:
     """Models that have a sample."""
     return plan.all if mask is None else np.ascontiguousarray(mask.numpy().reshape(-1))
-
-
-def as_absorbed(plan: Plan, figures: np.ndarray, event: np.ndarray, errors: np.ndarray) -> Absorbed:
-    """What loops found, as tensors."""
-    novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *plan.shape)).unbind()
-    report = UpdateReport(torch.from_numpy(event.reshape(plan.shape)), novelty, nis, weight)
-    return Absorbed(report, torch.from_numpy(errors.reshape(plan.one)), variance)

@@ -13,7 +13,7 @@ from numba import njit, types
 from ...base import FARTHEST
 from ...misled import MISLED_RATE, WORSE
 from .. import plan as P
-from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, Z90_SQUARED
+from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, RING_SIZE, Z90_SQUARED
 from .numba_kernels import absorb, kernel_row, kernel_slopes, times
 from .numba_math import (
     A1,
@@ -33,15 +33,36 @@ from .numba_math import (
 from .numba_network import network, network_slopes
 
 
-@njit(INT(I1), **INNER)
-def values_of(p):
-    """Length of a network's values, all layers together; of the input where there is none."""
-    total = p[P.IN]
+@njit(types.void(I1, INT, A1, A1), **INNER)
+def _embed(p, own, values, q):
+    """``q``: z as the kernel sees it, in its lengthscales and with a network's features behind.
+
+    ``values`` begins with z and takes each layer of the network, ``own`` is the place of the kernel.
+    """
+    d, n_s = p[P.IN], p[P.IN] - p[P.ACTIONS]
+    log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, n_s)
+    for j in range(n_s):
+        q[j] = values[j] * exp(-log_lengthscale[j])
+    for j in range(n_s, d):
+        q[j] = values[j]
     if p[P.LAYERS] > 0:
         widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        for layer in range(1, p[P.LAYERS] + 1):
-            total += widths[layer]
-    return total
+        network(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values)
+        features = p[P.WIDTH] - d
+        for j in range(features):
+            q[d + j] = values[values.shape[0] - features + j]
+
+
+@njit(types.void(I1), **COMMON)
+def embed_fleet(p):
+    """The bases as the kernels see them, after torch has changed them or the kernels."""
+    d, M, W = p[P.IN], p[P.SLOTS], p[P.WIDTH]
+    values = np.empty(p[P.VALUES])
+    for i in range(p[P.MODELS] * M):
+        z = vector_at(p[P.BASIS], i, d)
+        for j in range(d):
+            values[j] = z[j]
+        _embed(p, i // M * p[P.OWN], values, vector_at(p[P.EMBEDDED], i, W))
 
 
 @njit(F(I1, INT, A1, A1, A1, A1, A1, A1), **INNER)
@@ -50,38 +71,23 @@ def look(p, b, x, values, q, k, psi, phi):
 
     ``values`` begins with z, x in the learner's units; ``q`` is z as the kernel sees it.
     """
-    d, M, own, unit = p[P.IN], p[P.SLOTS], b * p[P.OWN], b * p[P.OWN_UNITS]
-    shift, scale = vector_at(p[P.SHIFT], unit, d), vector_at(p[P.SCALE], unit, d)
+    d, M, own = p[P.IN], p[P.SLOTS], b * p[P.OWN]
+    shift, scale = vector_at(p[P.SHIFT], b, d), vector_at(p[P.SCALE], b, d)
     reach = vector_at(p[P.REACH], 0, d)
     for j in range(d):
         values[j] = min(max((x[j] - shift[j]) / scale[j], -reach[j]), reach[j])
-    n_a, n_lengths = p[P.ACTIONS], p[P.WIDTH] - p[P.ACTIONS]
-    if p[P.LAYERS] > 0:
-        lengthscale, n_lengths = vector_at(p[P.LOG_LENGTHSCALE], own, d), 0
-        widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        network(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values)
-        features = p[P.WIDTH] - d
-        for j in range(d):
-            q[j] = values[j] * exp(-lengthscale[j])
-        for j in range(features):
-            q[d + j] = values[values.shape[0] - features + j]
-        log_lengthscale = np.zeros(p[P.WIDTH])
-        basis = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
-    else:
-        for j in range(d):
-            q[j] = values[j]
-        log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, n_lengths)
-        basis = matrix_at(p[P.BASIS], b, M, d)
+    _embed(p, own, values, q)
+    n_a, basis = p[P.ACTIONS], matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
     return kernel_row(
-        p[P.KIND], n_a, q, basis, vector_at(p[P.ACTIVE], b, M), log_lengthscale,
-        vector_at(p[P.LOG_VARIANCE], own, 1)[0], vector_at(p[P.LOG_ACTION], own, n_a), k, psi, phi,
+        p[P.KIND], n_a, q, basis, vector_at(p[P.ACTIVE], b, M), vector_at(p[P.LOG_VARIANCE], own, 1)[0],
+        vector_at(p[P.LOG_ACTION], own, n_a), k, psi, phi,
     )  # fmt: skip
 
 
 @njit(F(I1, INT, F, A1, A1, A1), **INNER)
 def mean_and_variance(p, b, prior, k, Ck, mean):
     """The mean in the units of y, not yet cut; returns the latent variance in the learner's. Makes Ck."""
-    M, m, unit = p[P.SLOTS], p[P.OUT], b * p[P.OWN_UNITS]
+    M, m = p[P.SLOTS], p[P.OUT]
     alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
     for o in range(m):
         mean[o] = 0.0
@@ -89,7 +95,7 @@ def mean_and_variance(p, b, prior, k, Ck, mean):
         row, a = alpha[i], k[i]
         for o in range(m):
             mean[o] += row[o] * a
-    shift, scale = vector_at(p[P.SHIFT_Y], unit, m), vector_at(p[P.SCALE_Y], unit, m)
+    shift, scale = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m)
     for o in range(m):
         mean[o] = mean[o] * scale[o] + shift[o]
     times(matrix_at(p[P.MOMENTS], 3 * b, M, M), k, Ck)
@@ -112,8 +118,8 @@ def cut(p, b, mean, inside):
 @njit(types.void(I1, INT, A1), **INNER)
 def noise_of(p, b, noise):
     """Observation noise of each output in squared units of y, as calibrated."""
-    m, unit = p[P.OUT], b * p[P.OWN_UNITS]
-    log_noise, scale = vector_at(p[P.LOG_NOISE], b, m), vector_at(p[P.SCALE_Y], unit, m)
+    m = p[P.OUT]
+    log_noise, scale = vector_at(p[P.LOG_NOISE], b, m), vector_at(p[P.SCALE_Y], b, m)
     for o in range(m):
         noise[o] = math.exp(log_noise[o]) * scale[o] * scale[o]
     if p[P.FACTOR]:
@@ -129,14 +135,14 @@ def query(p, b, with_variance, x, mean, variance, J, dv):
     ``variance`` and ``dv`` are those of a unit output scale in their first entry and row.
     """
     d, m, M, W = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH]
-    n_a, unit, own = p[P.ACTIONS], b * p[P.OWN_UNITS], b * p[P.OWN]
-    values, q, inside = np.empty(values_of(p)), np.empty(W), np.empty(m)
+    n_a, own = p[P.ACTIONS], b * p[P.OWN]
+    values, q, inside = np.empty(p[P.VALUES]), np.empty(W), np.empty(m)
     k, psi, Ck = np.empty(M), np.empty(M), np.empty(M)
     phi = np.empty(M if n_a > 0 else 0)
     prior = look(p, b, x, values, q, k, psi, phi)
     v = mean_and_variance(p, b, prior, k, Ck, mean)
     cut(p, b, mean, inside)
-    scale_y = vector_at(p[P.SCALE_Y], unit, m)
+    scale_y = vector_at(p[P.SCALE_Y], b, m)
     if with_variance:
         for o in range(m):
             variance[o] = v * scale_y[o] * scale_y[o]
@@ -150,28 +156,21 @@ def query(p, b, with_variance, x, mean, variance, J, dv):
             left[i, o] = alpha[i, o]
         for o in range(m, rows):
             left[i, o] = 2.0 * Ck[i]
-    if p[P.LAYERS] > 0:
-        basis, log_lengthscale = matrix_at(p[P.EMBEDDED], b, M, W), np.zeros(W)
-    else:
-        basis, log_lengthscale = matrix_at(p[P.BASIS], b, M, W), vector_at(p[P.LOG_LENGTHSCALE], own, W - n_a)
     log_action = vector_at(p[P.LOG_ACTION], own, n_a)
-    kernel_slopes(n_a, q, basis, psi, phi, log_lengthscale, log_action, left, slopes)
+    kernel_slopes(q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, log_action, left, slopes)
     for o in range(m, rows):  # k(x, x) of an action-linear kernel
         log_variance = vector_at(p[P.LOG_VARIANCE], own, 1)[0]
         for j in range(n_a):
-            slopes[o, W - n_a + j] += 2.0 * q[W - n_a + j] * math.exp(log_variance + log_action[j])
-    if p[P.LAYERS] > 0:
-        lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d)
-        by, out = np.empty((rows, W - d)), np.empty((rows, d))
+            slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
+    log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d - n_a)
+    for j in range(d - n_a):
+        by_q = exp(-log_lengthscale[j])
         for r in range(rows):
-            for j in range(d):
-                out[r, j] = slopes[r, j] * exp(-lengthscale[j])
-            for j in range(W - d):
-                by[r, j] = slopes[r, d + j]
+            slopes[r, j] *= by_q
+    if p[P.LAYERS] > 0:
         widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        network_slopes(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values, by, out)
-        slopes = out
-    scale, reach = vector_at(p[P.SCALE], unit, d), vector_at(p[P.REACH], 0, d)
+        network_slopes(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values, slopes)
+    scale, reach = vector_at(p[P.SCALE], b, d), vector_at(p[P.REACH], 0, d)
     for j in range(d):
         by_x = 1.0 / scale[j] if abs(values[j]) < reach[j] else 0.0
         for o in range(m):
@@ -205,8 +204,8 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
 @njit(INT(I1, INT, A1, A1, A1, A1, F, A1, A1, A1, A1), **INNER)
 def learn(p, b, values, q, k, Ck, prior, y, t, figures, error):
     """Learn the sample whose k, k(x, x) and Ck are at hand; returns the event. ``t``: room for y in units."""
-    d, m, M, unit = p[P.IN], p[P.OUT], p[P.SLOTS], b * p[P.OWN_UNITS]
-    shift, scale = vector_at(p[P.SHIFT_Y], unit, m), vector_at(p[P.SCALE_Y], unit, m)
+    d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
+    shift, scale = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m)
     log_noise, log_s2 = vector_at(p[P.LOG_NOISE], b, m), 0.0
     for o in range(m):
         t[o] = (y[o] - shift[o]) / scale[o]
@@ -215,10 +214,9 @@ def learn(p, b, values, q, k, Ck, prior, y, t, figures, error):
     basis = matrix_at(p[P.BASIS], b, M, d)
     for j in range(d):
         basis[slot[0], j] = values[j]
-    if p[P.LAYERS] > 0:
-        embedded = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
-        for j in range(q.shape[0]):
-            embedded[slot[0], j] = q[j]
+    embedded = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
+    for j in range(q.shape[0]):
+        embedded[slot[0], j] = q[j]
     constants = vector_at(p[P.FIGURES], 0, 3)
     return absorb(
         t, prior, math.exp(log_s2 / m), k, Ck, vector_at(p[P.ACTIVE], b, M), integers_at(p[P.COUNT], b, 1),
@@ -246,42 +244,39 @@ def grow_largest(p, on, y):
                 largest[o] = max(largest[o], abs(y_[o]))
 
 
-@njit(types.boolean(I1, I1, ON, INT, INT, A2, A2), **INNER)
-def changed(p, turn, on, x, y, figures, errors):
-    """What DetectChanges notes of a sample per model; whether a model faces another system."""
-    B, d, m, alarm = p[P.MODELS], p[P.IN], p[P.OUT], False
-    place = turn[P.RING_PLACE]
-    for b in range(B):
+@njit(types.boolean(I1, INT, ON, INT, A2, A2), **INNER)
+def changed(p, n, on, y, figures, errors):
+    """What DetectChanges notes of the sample after n per model; whether a model faces another system."""
+    m, alarm = p[P.OUT], False
+    for b in range(p[P.MODELS]):
         level, misled = vector_at(p[P.CHANGED], b, 1), vector_at(p[P.MISLED], b, 1)
-        at = place * B + b
-        ring_x, ring_y = vector_at(p[P.RING_X], at, d), vector_at(p[P.RING_Y], at, m)
-        x_, y_ = vector_at(x, b, d), vector_at(y, b, m)
-        for j in range(d):
-            ring_x[j] = x_[j]
-        for o in range(m):
-            ring_y[o] = y_[o]
         if on[b]:
-            unit, wrong, size = b * p[P.OWN_UNITS], 0.0, 0.0
-            shift, scale = vector_at(p[P.SHIFT_Y], unit, m), vector_at(p[P.SCALE_Y], unit, m)
+            y_, wrong, size = vector_at(y, b, m), 0.0, 0.0
+            shift, scale = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m)
             for o in range(m):
                 t = (y_[o] - shift[o]) / scale[o]
                 wrong, size = wrong + errors[b, o] * errors[b, o], size + t * t
             level[0] += RATE * ((1.0 if figures[1, b] > LARGE else 0.0) - level[0])
             misled[0] += MISLED_RATE * ((1.0 if wrong > WORSE * size else 0.0) - misled[0])
-        vector_at(p[P.RING], at, 1)[0] = level[0] if on[b] else np.inf
+        vector_at(p[P.LEVELS], n % RING_SIZE * p[P.MODELS] + b, 1)[0] = level[0] if on[b] else np.inf
         alarm |= level[0] > ALARM or misled[0] > ALARM
     return alarm
 
 
-@njit(types.void(I1, I1, ON, INT, INT, A2, A2), **INNER)
-def keep(p, turn, on, x, y, figures, errors):
-    """What the other parts note of a sample per model, and the learner itself."""
-    B, d, m = p[P.MODELS], p[P.IN], p[P.OUT]
-    window, past = turn[P.WINDOW_PLACE], turn[P.PAST_PLACE]
-    for b in range(B):
-        x_, y_, one = vector_at(x, b, d), vector_at(y, b, m), 1.0 if on[b] else 0.0
+@njit(types.boolean(I1, INT, ON, INT, INT, A2, A2), **INNER)
+def note(p, n, on, x, y, figures, errors):
+    """All notes of the sample after n (-1: none) per model; whether a model faces another system."""
+    if n < 0:
+        return False
+    d, m = p[P.IN], p[P.OUT]
+    grow_largest(p, on, y)
+    for b in range(p[P.MODELS]):
+        one, at = 1.0 if on[b] else 0.0, b * p[P.RECENT_SIZE] + n % p[P.RECENT_SIZE]
+        write(p[P.RECENT_X], at, vector_at(x, b, d))
+        write(p[P.RECENT_Y], at, vector_at(y, b, m))
+        vector_at(p[P.RECENT_ON], at, 1)[0] = one
+        vector_at(p[P.RECENT], at, 1)[0] = figures[2, b] * one
         vector_at(p[P.PENDING], b, 1)[0] += one
-        weight = figures[2, b] * one
         if p[P.FACTOR] and on[b]:
             factor, log_noise = vector_at(p[P.FACTOR], b, m), vector_at(p[P.LOG_NOISE], b, m)
             for o in range(m):
@@ -289,40 +284,10 @@ def keep(p, turn, on, x, y, figures, errors):
                 missed = 1.0 if errors[b, o] * errors[b, o] > Z90_SQUARED * variance else 0.0
                 moved = factor[o] + CALIBRATION_RATE * (missed - 0.1)
                 factor[o] = min(max(moved, FACTOR_LEAST), FACTOR_MOST)
-        if window >= 0:
-            at = b * p[P.WINDOW_SIZE] + window
-            write(p[P.WINDOW_X], at, x_)
-            write(p[P.WINDOW_Y], at, y_)
-            vector_at(p[P.WINDOW], at, 1)[0] = weight
-        if past >= 0:
-            at = b * p[P.PAST_SIZE] + past
-            write(p[P.PAST_X], at, x_)
-            write(p[P.PAST_Y], at, y_)
-            vector_at(p[P.PAST], at, 1)[0] = weight
-    if past >= 0:
-        vector_at(p[P.PAST_ABSORBED], past, 1)[0] = 0.0
-        vector_at(p[P.PAST_NUMBER], past, 1)[0] = turn[P.NUMBER]
+    return p[P.CHANGED] != 0 and changed(p, n, on, y, figures, errors)
 
 
-@njit(types.boolean(I1, I1, ON, INT, INT, A2, A2), **INNER)
-def note(p, turn, on, x, y, figures, errors):
-    """All notes of a sample; True where a model faces another system: then those of other parts are left."""
-    if turn[P.MODE] != P.NOTE:
-        return False
-    grow_largest(p, on, y)
-    if turn[P.BLOCK_PLACE] >= 0:
-        for b in range(p[P.MODELS]):
-            at, one = b * p[P.BLOCK_SIZE] + turn[P.BLOCK_PLACE], 1.0 if on[b] else 0.0
-            write(p[P.BLOCK], at, vector_at(x, b, p[P.IN]))
-            write(p[P.BLOCK_Y], at, vector_at(y, b, p[P.OUT]))
-            vector_at(p[P.BLOCK_ON], at, 1)[0] = vector_at(p[P.BLOCK_ON_Y], at, 1)[0] = one
-    if p[P.CHANGED] and changed(p, turn, on, x, y, figures, errors):
-        return True
-    keep(p, turn, on, x, y, figures, errors)
-    return False
-
-
-@njit(types.boolean(I1, INT, INT), **COMMON)
+@njit(types.boolean(I1, INT, INT), **INNER)
 def are_finite(p, x, y):
     """Whether the squares of a sample per model are."""
     n, m, total = p[P.MODELS] * p[P.IN], p[P.MODELS] * p[P.OUT], 0.0
@@ -334,16 +299,21 @@ def are_finite(p, x, y):
     return math.isfinite(total)
 
 
-@njit(types.boolean(I1, I1, ON, INT, INT, A2, I1, A2), **COMMON)
-def update_fleet(p, turn, on, x, y, figures, event, errors):
-    """One sample per model where ``on``, given by addresses; see :func:`note` for what it returns.
+@njit(INT(I1, INT, ON, INT, INT, A2, I1, A2), **COMMON)
+def update_fleet(p, n, on, x, y, figures, event, errors):
+    """The sample after n (-1: without notes) per model where ``on``, given by addresses.
+
+    Returns:
+        1 where a model faces another system, else 0; -1: a sample is not finite, and nothing was done.
 
     Args:
         figures: novelty, nis, weight and latent variance of each model; as they are where not ``on``.
         errors: innovations ``(models, out)``, in the learner's units.
     """
+    if not are_finite(p, x, y):
+        return -1
     d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
-    values, q, t = np.empty(values_of(p)), np.empty(p[P.WIDTH]), np.empty(m)
+    values, q, t = np.empty(p[P.VALUES]), np.empty(p[P.WIDTH]), np.empty(m)
     k, psi, Ck, phi, found = np.empty(M), np.empty(M), np.empty(M), np.empty(M), np.empty(4)
     for b in range(p[P.MODELS]):
         if not on[b]:
@@ -353,4 +323,4 @@ def update_fleet(p, turn, on, x, y, figures, event, errors):
         event[b] = learn(p, b, values, q, k, Ck, prior, vector_at(y, b, m), t, found, errors[b])
         for r in range(4):
             figures[r, b] = found[r]
-    return note(p, turn, on, x, y, figures, errors)
+    return int(note(p, n, on, x, y, figures, errors))

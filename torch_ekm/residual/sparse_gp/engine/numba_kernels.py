@@ -51,22 +51,20 @@ def _correlations(kind, variance, active, k, psi):
         psi[i] = psi[i] if active[i] != 0.0 else 0.0
 
 
-@njit(F(INT, INT, A1, A2, A1, A1, F, A1, A1, A1, A1), **INNER)
-def kernel_row(kind, n_a, z, basis, active, log_lengthscale, log_variance, log_action, k, psi, phi):
-    """k between z and the basis; returns k(z, z).
+@njit(F(INT, INT, A1, A2, A1, F, A1, A1, A1, A1), **INNER)
+def kernel_row(kind, n_a, q, basis, active, log_variance, log_action, k, psi, phi):
+    """k between q and the basis, both as the kernel sees them; returns k(q, q).
 
-    ``psi`` and ``phi`` make the derivatives: ``dk/dz = psi L^-2 (basis - z)`` of a state,
-    ``phi Lambda basis`` of an action.
+    ``psi`` and ``phi`` make the derivatives: ``dk/dq = psi (basis - q)`` of a state, ``phi Lambda basis`` of
+    an action.
     """
-    n, n_s = basis.shape[0], z.shape[0] - n_a
+    n, n_s = basis.shape[0], q.shape[0] - n_a
     start = 0.0 if n_s > 0 else 1.0  # without a state it is a LinearKernel, which has a constant
-    variance, w = math.exp(log_variance), np.empty(n_s)
-    for j in range(n_s):
-        w[j] = exp(-log_lengthscale[j])
+    variance = math.exp(log_variance)
     for i in range(n):
         d2, point = 0.0, basis[i]
         for j in range(n_s):
-            u = (point[j] - z[j]) * w[j]
+            u = point[j] - q[j]
             d2 += u * u
         k[i] = d2
     _correlations(kind, variance, active, k, psi)
@@ -74,8 +72,8 @@ def kernel_row(kind, n_a, z, basis, active, log_lengthscale, log_variance, log_a
         return variance
     norm, by = start, np.empty(n_a)
     for j in range(n_a):
-        by[j] = z[n_s + j] * math.exp(log_action[j])
-        norm += z[n_s + j] * by[j]
+        by[j] = q[n_s + j] * math.exp(log_action[j])
+        norm += q[n_s + j] * by[j]
     for i in range(n):
         inner = start
         for j in range(n_a):
@@ -86,28 +84,28 @@ def kernel_row(kind, n_a, z, basis, active, log_lengthscale, log_variance, log_a
     return variance * norm
 
 
-@njit(types.void(INT, A1, A2, A1, A1, A1, A1, A2, A2), **INNER)
-def kernel_slopes(n_a, z, basis, psi, phi, log_lengthscale, log_action, left, out):
-    """``out = left' dk/dz``, ``left (slots, rows)``."""
-    n_s, rows, u = z.shape[0] - n_a, out.shape[0], np.empty(z.shape[0])
+@njit(types.void(A1, A2, A1, A1, A1, A2, A2), **INNER)
+def kernel_slopes(q, basis, psi, phi, log_action, left, out):
+    """``out = left' dk/dq``, ``left (slots, rows)``."""
+    n_a = log_action.shape[0]
+    n_s, rows, u = q.shape[0] - n_a, out.shape[0], np.empty(q.shape[0])
     out[:] = 0.0
     for i in range(basis.shape[0]):
         if psi[i] == 0.0 and (n_a == 0 or phi[i] == 0.0):
             continue
         point, a = basis[i], psi[i]
         for j in range(n_s):
-            u[j] = a * (point[j] - z[j])
+            u[j] = a * (point[j] - q[j])
         for j in range(n_s, n_s + n_a):
             u[j] = phi[i] * point[j]
         for r in range(rows):
             to, b = out[r], left[i, r]
             for j in range(u.shape[0]):
                 to[j] += b * u[j]
-    for j in range(u.shape[0]):
-        u[j] = exp(-2.0 * log_lengthscale[j]) if j < n_s else math.exp(log_action[j - n_s])
-    for r in range(rows):
-        for j in range(u.shape[0]):
-            out[r, j] *= u[j]
+    for j in range(n_a):
+        lam = math.exp(log_action[j])
+        for r in range(rows):
+            out[r, n_s + j] *= lam
 
 
 @njit(types.void(A2, A1, A1), **INNER)
@@ -119,6 +117,16 @@ def times(A, vector, out):
         for j in range(n):
             total += row[j] * vector[j]
         out[i] = total
+
+
+@njit(types.void(A2, F, A1), **INNER)
+def _add_square(A, a, u):
+    """``A += a u u'``."""
+    n = u.shape[0]
+    for i in range(n):
+        row, b = A[i], a * u[i]
+        for j in range(n):
+            row[j] += b * u[j]
 
 
 @njit(F(F, F), **INNER)
@@ -248,33 +256,23 @@ def absorb(
         for o in range(m):
             vectors[1, slot, o] += t[o] * precision
     else:
+        _add_square(W, precision, e)
         for i in range(M):
             s[i] += e[i]
-            row, a = W[i], precision * e[i]
-            for j in range(M):
-                row[j] += a * e[j]
             for o in range(m):
                 vectors[1, i, o] += e[i] * t[o] * precision
     for i in range(M):
         for o in range(m):
             vectors[0, i, o] += s[i] * error[o] * gain
+    if not (novel and full):
+        _add_square(C, -gain, s)
     if not novel:
-        for i in range(M):
-            row, a = C[i], -gain * s[i]
-            for j in range(M):
-                row[j] += a * s[j]
         return 1
     active[slot] = 1.0
     e[slot] -= 1.0  # p of the recursion
     grow = 1.0 / gamma
     if not full:
-        for i in range(M):
-            row, a = C[i], -gain * s[i]
-            for j in range(M):
-                row[j] += a * s[j]
-            row, a = Q[i], grow * e[i]
-            for j in range(M):
-                row[j] += a * e[j]
+        _add_square(Q, grow, e)
         count[0] += 1
         slot_[0] += 1
         return 2

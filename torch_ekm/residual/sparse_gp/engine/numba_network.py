@@ -38,17 +38,17 @@ def network(widths, weights, own, values):
         at += n_in
 
 
-@njit(types.void(I1, I1, INT, A1, A2, A2), **INNER)
-def network_slopes(widths, weights, own, values, by, out):
-    """``out += by dnet/dz``, from the features back: ``by (rows, features)``."""
+@njit(types.void(I1, I1, INT, A1, A2), **INNER)
+def network_slopes(widths, weights, own, values, slopes):
+    """``slopes[:, :d] += slopes[:, d:] dnet/dz``, from the features back; d is the input's width."""
     layers, widest = widths.shape[0] - 1, 0
     for layer in range(layers + 1):
         widest = max(widest, widths[layer])
     at, both = values.shape[0] - widths[layers], np.empty((2, widest))
-    for r in range(by.shape[0]):
+    for r in range(slopes.shape[0]):
         now, begin = 0, at
         for j in range(widths[layers]):
-            both[0, j] = by[r, j]
+            both[0, j] = slopes[r, widths[0] + j]
         for layer in range(layers - 1, -1, -1):
             n_in, n_out = widths[layer], widths[layer + 1]
             W, old, new = matrix_at(weights[2 * layer], own, n_in, n_out), both[now], both[1 - now]
@@ -63,4 +63,4 @@ def network_slopes(widths, weights, own, values, by, out):
                     new[i] *= 1.0 - values[begin + i] * values[begin + i]
             now = 1 - now
         for j in range(widths[0]):
-            out[r, j] += both[now, j]
+            slopes[r, j] += both[now, j]

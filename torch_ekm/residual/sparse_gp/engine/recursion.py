@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 
@@ -20,14 +19,6 @@ TIE, TIE_KL = 1e-9, 1e-14
 LEAST_NOVELTY = 1e-12
 
 
-class Absorbed(NamedTuple):
-    """What an update did with one sample per model."""
-
-    report: UpdateReport
-    innovation: Float[Tensor, "*batch out"]  #: before the update, as the latent variance
-    variance: Float[Tensor, "*batch"]
-
-
 def absorb(
     posterior: SparsePosterior,
     x: Float[Tensor, "*batch in"],
@@ -36,7 +27,7 @@ def absorb(
     s2: Float[Tensor, "*batch"],
     mask: Float[Tensor, "*batch"] | None,
     weighing: Sequence[Part] = (),
-) -> Absorbed:
+) -> tuple[UpdateReport, Tensor, Tensor]:
     """One sample per model, without a branch on data (a mask multiplies every change by 0)::
 
         e = Qk, gamma = k** - k'e, v = k** + k'Ck, i = y - mean
@@ -111,7 +102,7 @@ def absorb(
         event = event * (mask > 0)
     # k** may be 0: no action, no effect
     novelty = gamma / prior.clamp_min(torch.finfo(prior.dtype).tiny)
-    return Absorbed(UpdateReport(event, novelty, nis, weight), innovation, v)
+    return UpdateReport(event, novelty, nis, weight), innovation, v
 
 
 def _add_and_prune(
