@@ -40,6 +40,8 @@ class TrackingAccuracy:
     """Object in the hand: rms of the whole angle."""
     object_position_mm: float
     """Object in the hand: rms of one coordinate."""
+    mean_chi2: float
+    """Mean of ``e^T Sigma^-1 e`` of the object's pose; 6 where the covariance is right."""
 
 
 def measure_tracking(
@@ -63,7 +65,7 @@ def measure_tracking(
     boards = MarkerBoard(0), MarkerBoard(4)
     tracker = MarkerTracker(known_camera or camera.camera, *boards)
     # columns: twist in the camera frame (6), about the normal, along and across the line of sight
-    board_errors, twists = [], []
+    board_errors, twists, chi2 = [], [], []
     for k in range(n_frames):
         rng = np.random.default_rng(seed + k)
         poses = [random_pose(rng, side * 0.048, 50.0) for side in (-1, 1)]
@@ -77,8 +79,11 @@ def measure_tracking(
             board_errors.append(_board_error(pose, board.rotation, board.position))
         relative = np.linalg.inv(poses[0]) @ poses[1]
         assert track.rotation is not None
+        assert track.covariance is not None
         turn = log(track.rotation @ torch.from_numpy(relative[:3, :3].T.copy()))
-        twists.append(torch.cat([track.position - torch.from_numpy(relative[:3, 3].copy()), turn]).numpy())
+        twist = torch.cat([track.position - torch.from_numpy(relative[:3, 3].copy()), turn])
+        twists.append(twist.numpy())
+        chi2.append(float(twist @ torch.linalg.solve(track.covariance, twist)))
     e, t = np.array(board_errors), np.array(twists)
 
     def rms(x: Array) -> float:
@@ -95,6 +100,7 @@ def measure_tracking(
         depth_bias_mm=1e3 * float(e[:, 4].mean()),
         object_rotation_deg=float(np.degrees(np.sqrt(3) * rms(t[:, 3:]))),
         object_position_mm=1e3 * rms(t[:, :3]),
+        mean_chi2=float(np.mean(chi2)),
     )
 
 

@@ -252,7 +252,7 @@ def test_how_far_a_shift_goes_a_plan_tells_and_j_m_does_not(tin) -> None:
     b = b - a * (a @ b)
     chosen = LookAndMoveController(EnhancedModel.for_grasp(model, start), FocusedPose([Direction(b, "mm")]))
     loop = ClosedLoop(plant, chosen, learn=False)
-    far, near = (PoseTarget.moved(start, b, millimetres=distance) for distance in (15, -8))
+    far, near = (PoseTarget.moved(start, b, millimetres=distance) for distance in (30, -8))
     assert not loop.reachability(far).reason
     told = loop.plan(far)
     assert told.end.kind is not PathEnd.NOTHING

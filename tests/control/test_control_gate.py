@@ -286,7 +286,8 @@ def test_an_encoder_of_a_motor_at_work_that_drifts_is_found_and_what_it_taught_i
     assert done.reason is Reason.ENCODER_DRIFT
     assert re.search("encoder 'thumb_distal' went 0[.][67][0-9]* deg more than its joints", done.stop.message)
     assert len(done.steps) <= 12
-    assert all(torch.equal(value, known[name]) for name, value in knowledge.state_dict().items())
+    left = {name: value for name, value in knowledge.state_dict().items() if name != "forces.reads"}
+    assert all(torch.equal(value, known[name]) for name, value in left.items())  # how pads read is no lesson
 
 
 @pytest.mark.parametrize("learns", [True, False])

@@ -9,7 +9,7 @@ from .._extras import require
 from ..exceptions import BusError, EKMError
 
 T = TypeVar("T")
-_PATIENCE_MS = 100.0  # for an answer, where the SDK's 34 ms are less: both ends may share a busy machine
+_PATIENCE_MS = 200.0  # for an answer, where the SDK's 34 ms are less: both ends may share a busy machine
 _LOOK = 0.001  # [s] the port sleeps for an answer before the SDK asks again
 _HARDWARE = (70, 1)
 _FAULTS = {0: "the voltage is wrong", 2: "overheated", 3: "the encoder is dead", 4: "electrical shock",

@@ -104,7 +104,8 @@ class Transmission:
     @staticmethod
     def _coupling_stiffness(hand: HandDescription, coupling: Array) -> Array:
         """``k_c`` of each coupling [N m/rad]: what bears in the linkage of a finger is rigid."""
-        between = max(_COUPLING_STIFFNESS, *(2 * actuator.stiffness for actuator in hand.actuators))
+        series = [one.stiffness for one in hand.actuators if one.stiffness < _LOOP_STIFFNESS]  # not rigid
+        between = max(_COUPLING_STIFFNESS, 2 * max(series, default=0.0))
         fingers = [{joint.name for joint in hand.urdf.joints_to(pad.link)} for pad in hand.pads]
         tied = [{hand.joint_names[joint] for joint in np.flatnonzero(row)} for row in coupling]
         linkage = [len(tie) > 1 and any(tie <= finger for finger in fingers) for tie in tied]
