@@ -94,17 +94,21 @@ def reachability(controller: LookAndMoveController, seen: Observation, target: P
     U, found, _ = torch.linalg.svd(focus.matrix @ scaled)
     gains = torch.cat([found, found.new_zeros(len(asked) - len(found))])
     least = float(_WEAK * torch.linalg.matrix_norm(scaled, 2))
-    if _is_turn(focus):  # the whole ranges of the motors, to first order, come as far as that
-        hand = controller.kinematic.hand
+    if _is_turn(focus):  # its path says more, if the whole ranges of the motors come as far to first order
+        hand, far = controller.kinematic.hand, focus.error(target, seen.state)
         way = float(np.linalg.norm((hand.actuator_upper - hand.actuator_lower)[moves.numpy()]))
-        least = max(least, focus.error(target, seen.state) / max(way, 1e-9))
+        most = float(gains[-1]) * way
+        if gains[-1] >= least and most >= far:
+            return Reachability(gains)
+        turns = (
+            f"the whole ranges of the motors turn the object by some {most / _DEG:.2g} deg about this axis"
+        )
+        return Reachability(gains, f"{turns}: choose a nearer target, or another axis")
     if gains[-1] < least:
         parts = sorted(zip(U[:, -1].abs().tolist(), map(str, focus.directions), strict=True), reverse=True)
         weak = " with ".join(name for share, name in parts if share > 0.3)
         held = f"{int((gains >= least).sum())} of the {len(gains)} directions of the focus"
         return Reachability(gains, f"the motors hold {held}, and too little of {weak}: leave a direction out")
-    if _is_turn(focus):  # its path says more
-        return Reachability(gains)
     tasks = (task.rows(model, whole) for task in (EffortTask(), OffAxisTask(), FocusTask()))
     solution, reason = build_qp(len(seen.a), [*tasks, within]).solve(), ""
     left = float(np.abs(solution.slack).max()) / max(focus.error(target, seen.state), 1e-9)
