@@ -13,6 +13,8 @@ from obedient_plant import Obedient
 
 from torch_ekm.control import (
     ClosedLoop,
+    EffortTask,
+    FocusTask,
     GripForceTask,
     HandKnowledge,
     LookAndMoveController,
@@ -106,6 +108,37 @@ def test_a_piece_in_which_a_pad_slides_is_chosen_about_where_it_leads(held, slip
     assert len(path) <= 8
     assert controller.focus.error(target, path[-1]) < 0.1 * DEG
     assert controller.focus.off_rotation(path[-1].minus(seen.state)) < 0.2 * DEG
+
+
+def test_a_grasp_that_its_forces_make_soft_is_gripped_no_harder(
+    held, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, axis, model = held
+    controller = LookAndMoveController(
+        model, axis, tasks=[EffortTask(), GripForceTask(force=8.0), FocusTask()]
+    )
+    lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
+
+    def gripped() -> tuple[float, float]:
+        rehearsal = Rehearsal(controller, seen, None, 2.5 * DEG)
+        forces = [piece.force for piece, _ in rehearsal.pieces()]
+        return rehearsal.first.grip.wanted, max((float(force.max()) for force in forces), default=0.0)
+
+    wanted, most = gripped()
+    assert wanted == 8.0
+    assert most > 7.0
+    linearize = KinematicModel.linearize
+
+    def softer(self, *args, **options):
+        """Without forces it would be twice as stiff."""
+        found = linearize(self, *args, **options)
+        free = options.get("forces") is not None and not bool(options["forces"].mu.any())
+        return dataclasses.replace(found, stability=2 * found.stability) if free else found
+
+    monkeypatch.setattr(KinematicModel, "linearize", softer)
+    wanted, most = gripped()
+    assert wanted == pytest.approx(float(lin.forces.normal.max()), abs=0.3)
+    assert most < wanted + 0.3
 
 
 def test_a_plan_changes_nothing(loop, target) -> None:

@@ -34,6 +34,7 @@ from .safety.watch import Watch
 
 _GRIPS, _AGAIN = 2, 4  # movements that only grip, before the first turn and in all, one after each turn
 _FULL, _LEAST = 0.75, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
+_ANY = 1e-6  # with a grip of any size, if no finger is weak
 
 
 class ClosedLoop:
@@ -221,7 +222,7 @@ class ClosedLoop:
             if turns:
                 firm = _LEAST if grips < _AGAIN and decision is not None and decision.turns else 0.0
             else:
-                firm = _FULL if grips < _GRIPS else 0.0
+                firm = _FULL if grips < _GRIPS else _ANY if grips < _AGAIN else 0.0
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:

@@ -101,7 +101,7 @@ def reachability(controller: LookAndMoveController, seen: Observation, target: P
         if gains[-1] >= least and most >= far:
             return Reachability(gains)
         turns = (
-            f"the whole ranges of the motors turn the object by some {most / _DEG:.2g} deg about this axis"
+            f"the whole ranges of the motors turn the object by some {most / _DEG:.1f} deg about this axis"
         )
         return Reachability(gains, f"{turns}: choose a nearer target, or another axis")
     if gains[-1] < least:

@@ -31,6 +31,8 @@ LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is pla
 _BENDS = 0.25 * _DEG  # of a piece beyond its linearization: it is chosen once more, about where it leads
 _HALVES = 3  # times that a piece is tried
 _DEVIATIONS = 2.0  # of servos' errors, that let no finger go
+_SOFTENS = 0.85  # of the stiffness without forces, below which a grasp is gripped no harder
+_FORCES = "mu", "force", "normal", "spin_moment"
 _GRIPPED = 0.95  # of the wanted grip
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
 _SLIDES = 0.05  # of its friction, that a pad at its limit has to spare
@@ -94,7 +96,7 @@ class Rehearsal:
         """The first one, with the grip before anything moves."""
         self.last: Decision | None = None
         self._failure: GraspError | None = None
-        self._too_long = False
+        self._too_long, self._most = False, math.inf
 
     @torch.no_grad()
     def pieces(self) -> Iterator[tuple[Piece, GraspState]]:
@@ -111,6 +113,8 @@ class Rehearsal:
             if hand.linearization is None:
                 self._failure = hand.failure
                 return
+            if self.first is None:
+                self._most = self._bears(hand.linearization)
             lin = controller.corrected(hand.linearization)
             self.last = decision = self._decide(here, force, lin)
             self.first = self.first or decision
@@ -133,6 +137,8 @@ class Rehearsal:
         desired = self._limiting(focus.step_scale * (focus.matrix @ error)) / focus.step_scale
         for _ in range(_HALVES):
             seen = controller.situation(lin, here.a, force, error, desired)
+            if seen.grip is not None:
+                seen = dataclasses.replace(seen, grip=min(seen.grip, self._most))
             decision = controller.choose(lin, seen)
             if not any(lets_go(self.hand.hand, piece, _DEVIATIONS) for piece in decision.pieces):
                 break
@@ -146,6 +152,14 @@ class Rehearsal:
             return decision
         again = dataclasses.replace(lin, manipulation_jacobian=J)
         return controller.choose(again, dataclasses.replace(seen, bend=rest))
+
+    def _bears(self, lin: Linearization) -> float:
+        """The hardest grip [N]: the present one where its forces have made the grasp soft; with more it would
+        buckle."""
+        forces = dataclasses.replace(lin.forces, **{name: 0 * getattr(lin.forces, name) for name in _FORCES})
+        free = self.hand.kinematic.linearize(lin.state, lin.contacts, forces=forces, on_unstable="flag")
+        soft = float(lin.stability) < _SOFTENS * float(free.stability)
+        return float(lin.forces.normal.max()) if soft else math.inf
 
     def _there(self, state: GraspState) -> bool:
         return self._target is not None and self._controller.focus.error(self._target, state) <= _THERE

@@ -114,7 +114,8 @@ class GripForceTask:
         if f_n is None:
             return None
         pads = seen.pads(model.kinematic)
-        wanted = grip_shares(f_n[pads], self.wanted(model.kinematic, seen))
+        grip = self.wanted(model.kinematic, seen) if seen.grip is None else seen.grip
+        wanted = grip_shares(f_n[pads], grip)
         change = np.clip(wanted - f_n[pads], -self.step, self.step) - seen.drift_of(pads)
         return Squares(as_array(model.kinematic.normal_force_sensitivity)[pads], change, self.weight)
 
