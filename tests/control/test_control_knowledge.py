@@ -256,28 +256,6 @@ def test_what_is_believed_is_shown(driven, tmp_path) -> None:
     assert bool(HandKnowledge.load(previous(path)).servo.estimate.any())
 
 
-def test_a_file_of_forces_with_a_drift_is_read(driven, tmp_path: Path) -> None:
-    """Before l, the drift of each pad was kept, and theta had an entry less."""
-    knowledge = HandKnowledge.of(driven.controller.kinematic.hand)
-    knowledge.load_state_dict(driven.knowledge.state_dict())
-    state = {name: value.clone() for name, value in knowledge.state_dict().items() if name != "error.tighter"}
-    at = [0, *range(2, state["forces.theta"].shape[-1])]
-    older = {
-        **state,
-        "forces.theta": state["forces.theta"][:, at],
-        "forces.evidence": state["forces.evidence"][:, at][:, :, at],
-        "forces.drift": torch.zeros(len(state["forces.theta"])),
-    }
-    knowledge.load_state_dict(older)
-    found = knowledge.state_dict()
-    for name in ("theta", "evidence"):
-        kept = state[f"forces.{name}"].clone()
-        kept[:, 1] = 0
-        if name == "evidence":
-            kept[:, :, 1] = 0
-        assert torch.equal(found[f"forces.{name}"], kept)
-
-
 def test_a_hand_that_dropped_an_object_grips_the_next_one_tighter() -> None:
     error = ModelError()
     error.slid(lost=True)

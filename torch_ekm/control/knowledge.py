@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import torch
 from torch import nn
 
 from .._files import write_whole
@@ -110,7 +109,6 @@ class HandKnowledge(Recorded, nn.Module):
         Raises:
             StateMismatchError: the state is of another hand, or holds NaN. Nothing was changed.
         """
-        state_dict = _of_now(state_dict)
         if strict:
             check_state(self, state_dict)
         self._before.clear()
@@ -150,7 +148,7 @@ class HandKnowledge(Recorded, nn.Module):
         """
         try:
             described, state = read(path)
-            made = rebuild(path, described, _of_now(state), known_classes())
+            made = rebuild(path, described, state, known_classes())
             if not isinstance(made, cls):
                 raise FileFormatError(path, f"holds a {type(made).__name__}, no {cls.__name__}")
             return made
@@ -159,24 +157,6 @@ class HandKnowledge(Recorded, nn.Module):
             if previous(path).is_file():
                 problem += f"; the last file that was good is {previous(path)}: copy it here to go on with it"
             raise FileFormatError(path, problem) from None
-
-
-def _of_now(state: Mapping[str, Any]) -> dict[str, Any]:
-    """Older files have a pace in place of the error of the model, and a drift of forces in place of l."""
-    if not state.keys() & {"pace", "error.square"}:  # of something else
-        return dict(state)
-    kept = {name: value for name, value in state.items() if name not in ("pace", "forces.drift")}
-    of_now = {f"error.{name}": value for name, value in ModelError().state_dict().items()}
-    of_now["forces.reads"] = torch.zeros(2, dtype=torch.float64)
-    if "forces.drift" in state:
-        theta, evidence = kept["forces.theta"], kept["forces.evidence"]
-        at = [0, *range(2, 1 + theta.shape[-1])]
-        kept["forces.theta"] = theta.new_zeros(*theta.shape[:-1], 1 + theta.shape[-1])
-        kept["forces.theta"][:, at] = theta
-        wider = evidence.new_zeros(len(theta), *2 * kept["forces.theta"].shape[-1:])
-        wider[:, torch.tensor(at)[:, None], at] = evidence
-        kept["forces.evidence"] = wider
-    return {**of_now, **kept}
 
 
 def previous(path: str | os.PathLike) -> Path:

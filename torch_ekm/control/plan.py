@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import torch
 
+from .._noise import DEGREE
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
@@ -24,11 +25,10 @@ if TYPE_CHECKING:
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
 
-_DEG = math.pi / 180
 _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
 _BACK = 1.5  # times off_rotation from which an object that is farther off is not turned back: it slips out
 _GRIP = 3  # pieces of a movement that grips: pads that read wrong are seen after it
-_CLOSE = 0.3 * _DEG  # [rad] from which one is enough
+_CLOSE = 0.3 * DEGREE  # [rad] from which one is enough
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Plan:
         return draw(self.errors[1:], stds, bands, grasps, self.safe)
 
     def __str__(self) -> str:
-        errors = [error / _DEG for error in self.errors]
+        errors = [error / DEGREE for error in self.errors]
         first = f"{errors[0]:.1f} deg to go; {self.safe} of {len(self.waypoints)} waypoints are safe"
         first += f", then {self.against}" if self.against else ""
         if self.end.kind is not PathEnd.NOTHING:
@@ -147,16 +147,16 @@ class WholeTurn:
     Sources: chance constraints by propagated covariances, Hewing, Kabzan and Zeilinger, IEEE TCST 28 (2020).
     """
 
-    piece: float = 2.5 * _DEG
+    piece: float = 2.5 * DEGREE
     """Largest step of the rehearsal [rad]."""
-    farthest: float = 30 * _DEG
+    farthest: float = 30 * DEGREE
     """Of one movement [rad]: what the model does not know at all is seen after it."""
     deviations: float = 2.0
-    off_rotation: float = 8 * _DEG
+    off_rotation: float = 8 * DEGREE
     """Off the focus [rad]; an object that is up to 1.5 times as far off may come back."""
     force: float = 0.6
     """Of a finger that touches [N]."""
-    margin: float = 2 * _DEG
+    margin: float = 2 * DEGREE
     """What a first piece alone may go beyond ``off_rotation``; forces do not hold it [rad]."""
 
     def plan(
@@ -234,7 +234,7 @@ class WholeTurn:
 
     def _off(self, band: Band, most: float) -> str:
         off = band.off + self.deviations * band.off_std
-        return f"the object may turn {off / _DEG:.1f} deg off the axis" if off > most else ""
+        return f"the object may turn {off / DEGREE:.1f} deg off the axis" if off > most else ""
 
     def _grip(
         self, controller: LookAndMoveController, seen: Observation, knowledge: HandKnowledge, firm: float
@@ -275,7 +275,7 @@ class WholeTurn:
         go = lets_go(controller.kinematic.hand, decision.pieces[0], self.deviations)
         if least > self.force and after <= self.off_rotation and not go:
             return decision
-        off = f"the object is {after / _DEG:.1f} deg off the axis"
+        off = f"the object is {after / DEGREE:.1f} deg off the axis"
         why = f"a finger keeps {least:.1f} N" if least <= self.force else go or off
         return controller.none(StopReason.GIVEN_UP, why, decision.desired)
 

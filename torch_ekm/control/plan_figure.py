@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from .._extras import require
+from .._noise import DEGREE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from ..model import Linearization
     from .decision import Band
 
-_DEG = math.pi / 180
 _STYLE = "torch_ekm.style"
 _PANELS = "to go [deg]", "off the axis [deg]", "share of the friction left", "normal forces [N]"
 
@@ -38,8 +38,8 @@ def draw(
         # a Figure of its own: pyplot would keep it alive and touch the caller's backend
         figure = require("matplotlib.figure").Figure(figsize=(8.0, 5.0), layout="constrained")
         panels = figure.subplots(2, 2, sharex=True).ravel().tolist()
-    _line(panels[0], [error / _DEG for error in errors], [std / _DEG for std in stds])
-    _line(panels[1], [band.off / _DEG for band in bands], [band.off_std / _DEG for band in bands])
+    _line(panels[0], [error / DEGREE for error in errors], [std / DEGREE for std in stds])
+    _line(panels[1], [band.off / DEGREE for band in bands], [band.off_std / DEGREE for band in bands])
     left = [_margins(lin) for lin in grasps]
     for name in dict.fromkeys(name for one in left for name in one):
         _line(panels[2], [one.get(name, math.nan) for one in left], label=name)

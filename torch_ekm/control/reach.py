@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from .._checks import check_kind
+from .._noise import DEGREE
 from ..exceptions import GraspError, ParameterError, SolverError
 from ..plant import Observation
 from ..typing import Float, Tensor
@@ -26,11 +27,10 @@ from .tasks import EffortTask, FocusTask, OffAxisTask
 if TYPE_CHECKING:
     from .knowledge import HandKnowledge
 
-_DEG = math.pi / 180
 _WEAK = 0.035  # of the largest gain: a direction that motors do not hold; those that they hold have .07
 _LEFT = 0.2  # of an error that the motors leave at the ends of their ranges, to decline it
 _OFF = (
-    12 * _DEG
+    12 * DEGREE
 )  # [rad] off a focus without turns, from which a target is declined: 3 mm alone turn by 8 to 10
 
 
@@ -48,7 +48,7 @@ class Reach:
     """The path."""
 
     def __str__(self) -> str:
-        return f"{self.angle / _DEG:.1f} deg ({self.end})"
+        return f"{self.angle / DEGREE:.1f} deg ({self.end})"
 
 
 @torch.no_grad()
@@ -58,7 +58,7 @@ def reach(
     """See :meth:`~torch_ekm.control.ClosedLoop.reach`."""
     if sign not in (1, -1):
         raise ParameterError("sign", sign, "1 or -1")
-    if not 0 < limit <= 170 * _DEG:
+    if not 0 < limit <= 170 * DEGREE:
         raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
     if not _is_turn(controller.focus):
         raise ParameterError("focus", controller.focus.matrix.tolist(), "a rotation about one axis")
@@ -90,7 +90,7 @@ def reachability(controller: LookAndMoveController, seen: Observation, target: P
     limits = (limit for limit in controller.limits if isinstance(limit, ActuatorLimit))
     within = dataclasses.replace(next(limits, ActuatorLimit()), step=math.inf).rows(model, whole)
     moves = torch.from_numpy(as_array(within.lower) < as_array(within.upper))
-    scaled = asked.new_tensor([[1250 * _DEG]] * 3 + [[1.0]] * 3) * lin.object_jacobian[:, moves]
+    scaled = asked.new_tensor([[1250 * DEGREE]] * 3 + [[1.0]] * 3) * lin.object_jacobian[:, moves]
     U, found, _ = torch.linalg.svd(focus.matrix @ scaled)
     gains = torch.cat([found, found.new_zeros(len(asked) - len(found))])
     least = float(_WEAK * torch.linalg.matrix_norm(scaled, 2))
@@ -101,7 +101,7 @@ def reachability(controller: LookAndMoveController, seen: Observation, target: P
         if gains[-1] >= least and most >= far:
             return Reachability(gains)
         turns = (
-            f"the whole ranges of the motors turn the object by some {most / _DEG:.1f} deg about this axis"
+            f"the whole ranges of the motors turn the object by some {most / DEGREE:.1f} deg about this axis"
         )
         return Reachability(gains, f"{turns}: choose a nearer target, or another axis")
     if gains[-1] < least:
@@ -118,7 +118,7 @@ def reachability(controller: LookAndMoveController, seen: Observation, target: P
             f"motors at the ends of their ranges leave {100 * left:.0f} % of the way; choose a nearer target"
         )
     elif off > _OFF:
-        reason = f"the object turns {off / _DEG:.0f} deg off the focus on the way; choose a nearer target"
+        reason = f"the object turns {off / DEGREE:.0f} deg off the focus on the way; choose a nearer target"
     return Reachability(gains, reason)
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
+from .._noise import DEGREE
 from ..exceptions import GraspError, NoContactError, UnstableGraspError
 from ..kinematics import GraspState
 from ..plant import Observation
@@ -24,11 +25,10 @@ if TYPE_CHECKING:
     from ..model import Linearization
     from .controller import LookAndMoveController
 
-_DEG = math.pi / 180
-_THERE = 0.1 * _DEG  # [rad] of the error, as a turn: the path ends
+_THERE = 0.1 * DEGREE  # [rad] of the error, as a turn: the path ends
 _MOST = 60  # pieces
-LONGEST = 60 * _DEG  # [rad] of an actuator in one movement: what follows is planned when it is there
-_BENDS = 0.25 * _DEG  # of a piece beyond its linearization: it is chosen once more, about where it leads
+LONGEST = 60 * DEGREE  # [rad] of an actuator in one movement: what follows is planned when it is there
+_BENDS = 0.25 * DEGREE  # of a piece beyond its linearization: it is chosen once more, about where it leads
 _HALVES = 3  # times that a piece is tried
 _DEVIATIONS = 2.0  # of servos' errors, that let no finger go
 _SOFTENS = 0.85  # of the stiffness without forces, below which a grasp is gripped no harder
