@@ -22,14 +22,13 @@ from torch_ekm.control import (
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.safety.watch import Watch
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.kinematics.servo_model import IdealServos
 from torch_ekm.plant import Observation
 
 DEG = math.pi / 180
 
 
 def watch_of(model) -> Watch:
-    return Watch(Guards(), model, 0.0, IdealServos(model.hand.actuator_names))
+    return Watch(Guards(), model, 0.0, HandKnowledge.of(model.hand, learns=False))
 
 
 def run(held, fault: Fault, since: int) -> Manipulation:

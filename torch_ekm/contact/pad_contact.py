@@ -140,18 +140,20 @@ def _along(solid: Solid, m: tuple, t: tuple, half: float, most: float) -> tuple[
     if abs(s) >= half:  # at a round end, crown or not
         return s, most
 
-    def slope(x: float) -> tuple[Vec, Vec, float]:
-        c = (m[0] + x * t[0], m[1] + x * t[1], m[2] + x * t[2])
-        n = solid.distance(*c)[1]
-        return c, n, n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
-
     step = 1e-6
-    (_, _, behind), (c, n, here), (_, _, ahead) = (slope(x) for x in (s - step, s, s + step))
+    (_, _, behind), (c, n, here), (_, _, ahead) = (_at(solid, m, t, x) for x in (s - step, s, s + step))
     if surface_curvature(solid.shape, c, n)[1]:
         return s, most  # without crown a pad along the face beyond the edge would jump to its end
     curved = min(here - behind, ahead - here) / step  # the face's, where s is within a step of its edge
     crown = min(most, max(0.0, most - curved))
     return (_closest(solid, m, t, half, crown) if crown < most else s), crown
+
+
+def _at(solid: Solid, m: tuple, t: tuple, s: float) -> tuple[Vec, Vec, float]:
+    """The point ``m + s t``, n there, and ``n . t``: the slope of d along the pad."""
+    c = (m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])
+    n = solid.distance(*c)[1]
+    return c, n, n[0] * t[0] + n[1] * t[1] + n[2] * t[2]
 
 
 def _closest(solid: Solid, m: tuple, t: tuple, half: float, epsilon: float) -> float:
@@ -164,8 +166,7 @@ def _closest(solid: Solid, m: tuple, t: tuple, half: float, epsilon: float) -> f
     """
 
     def slope(s: float) -> float:
-        n = solid.distance(m[0] + s * t[0], m[1] + s * t[1], m[2] + s * t[2])[1]
-        return n[0] * t[0] + n[1] * t[1] + n[2] * t[2] + epsilon * s
+        return _at(solid, m, t, s)[2] + epsilon * s
 
     a, b = -half, half
     fa, fb = slope(a), slope(b)

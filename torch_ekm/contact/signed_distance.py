@@ -21,9 +21,8 @@ from ..typing import Array
 Vec = tuple[float, float, float]
 Distance = Callable[[float, float, float], tuple[float, Vec]]
 """Point [m] -> signed distance [m] and its gradient, the outward normal."""
-_NO_DIRECTION = (
-    1e-150  # [m]: squares of less leave the range of a float, and a unit vector by them its length
-)
+# squares of less leave the range of a float, and a unit vector by them its length [m]
+_NO_DIRECTION = 1e-150
 
 
 def point_distance(shape: Shape) -> Distance:
@@ -154,6 +153,6 @@ def _box_distances(p: Array, half: Array) -> tuple[Array, Array]:
     outside = np.maximum(excess, 0.0)
     reach = np.linalg.norm(outside, axis=-1)
     nearest_face = np.eye(p.shape[-1])[excess.argmax(axis=-1)]
-    is_out = reach > 0
+    is_out = reach > _NO_DIRECTION
     direction = np.where(is_out[..., None], outside / np.maximum(reach, 1e-300)[..., None], nearest_face)
     return np.where(is_out, reach, excess.max(axis=-1)), direction * np.where(p < 0, -1.0, 1.0)

@@ -23,21 +23,23 @@ if TYPE_CHECKING:
     from .focus import PoseTarget
     from .knowledge import HandKnowledge
 
+DEVIATIONS = 2.0
+"""At which a waypoint, and a piece from rest, is safe."""
 _LEVER = 0.03  # [m]: a share of a rotation counts as much as that share of this translation
 _SERVO = 0.05  # of its way, that a servo errs
 _SHARE = 0.15  # of the way that a normal force has come: what the model does not know of it
 
 
-def servo_std(lin: Linearization, w: Float[Tensor, " n_a"], pads: Tensor | list[int]) -> Tensor:
+def servo_std(lin: Linearization, w: Float[Tensor, " n_a"], rows: list[int]) -> Tensor:
     """``sqrt(sum_j (df_n/da_j sd_j)^2)``: what servos that err by ``sd_j`` change of normal forces [N].
 
     A finger of 20 N m/rad loses or gains several newtons in a degree of its motor, a soft one some tenths.
     """
     error = (NOISE.servo**2 + (_SERVO * w).square()).sqrt()
-    return (lin.described_normal_sensitivity[pads] * error).square().sum(-1).sqrt()
+    return (lin.described_normal_sensitivity[rows] * error).square().sum(-1).sqrt()
 
 
-def lets_go(hand: HandDescription, piece: Piece, deviations: float) -> str:
+def lets_go(hand: HandDescription, piece: Piece, deviations: float = DEVIATIONS) -> str:
     """Why servos that err may let a finger go in a piece that is made from rest; empty: they do not."""
     if piece.force is None:
         return ""
@@ -112,8 +114,7 @@ class Bands:
             spread = self._knowledge.forces.spread(self._pull, self._said, self._turned)
         servo = torch.zeros_like(spread)
         servo[pads] = servo_std(piece.linearization, self._pull, rows)
-        spread = (spread.square() + servo.square()).sqrt()
-        return force, (spread.square() + (_SHARE * self._swing).square()).sqrt()
+        return force, (spread.square() + servo.square() + (_SHARE * self._swing).square()).sqrt()
 
     def _of_model(self) -> Array:
         """Covariance of what neither figures nor g know: shares of the way, and noise."""

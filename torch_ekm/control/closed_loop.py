@@ -179,8 +179,8 @@ class ClosedLoop:
             self._gate.last = self._gate.failure = None
             known = self.learned.state()
             try:
-                watch = Watch(self.safety.guards, controller.kinematic, self.safety.rule.tolerance,
-                              self.knowledge.servo, self.knowledge.forces.usual)  # fmt: skip
+                rule, guards = self.safety.rule, self.safety.guards
+                watch = Watch(guards, controller.kinematic, rule.tolerance, self.knowledge)
                 stop = yield from self._movements(target, watch)
                 if watch.lie or stop.reason is StopReason.WRONG_WAY:
                     self.learned.restore(known)

@@ -14,7 +14,7 @@ from .._noise import DEGREE
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
-from .bands import Band, Bands, lets_go
+from .bands import DEVIATIONS, Band, Bands, lets_go
 from .decision import Decision, Piece, StopReason
 from .focus import FocusedPose, PoseTarget
 from .rehearsal import LONGEST, End, PathEnd, Rehearsal
@@ -151,7 +151,7 @@ class WholeTurn:
     """Largest step of the rehearsal [rad]."""
     farthest: float = 30 * DEGREE
     """Of one movement [rad]: what the model does not know at all is seen after it."""
-    deviations: float = 2.0
+    deviations: float = DEVIATIONS
     off_rotation: float = 8 * DEGREE
     """Off the focus [rad]; an object that is up to 1.5 times as far off may come back."""
     force: float = 0.6
@@ -242,10 +242,8 @@ class WholeTurn:
         """The movement that grips as the object needs it, as far as it is safe; None: it is gripped so, or
         grips no better."""
         here = PoseTarget(seen.position, seen.rotation)
-        rehearsal, bands = (
-            Rehearsal(controller, seen, None, self.piece),
-            Bands(controller, knowledge, seen, here),
-        )
+        rehearsal = Rehearsal(controller, seen, None, self.piece)
+        bands = Bands(controller, knowledge, seen, here)
         waypoints: list[Waypoint] = []
         for piece, state in rehearsal.pieces():
             if not waypoints and not _loose(rehearsal.first, firm):

@@ -29,9 +29,8 @@ if TYPE_CHECKING:
 
 _WEAK = 0.035  # of the largest gain: a direction that motors do not hold; those that they hold have .07
 _LEFT = 0.2  # of an error that the motors leave at the ends of their ranges, to decline it
-_OFF = (
-    12 * DEGREE
-)  # [rad] off a focus without turns, from which a target is declined: 3 mm alone turn by 8 to 10
+# off a focus without turns, from which a target is declined [rad]: 3 mm alone turn by 8 to 10 deg
+_OFF = 12 * DEGREE
 
 
 @dataclass(frozen=True)

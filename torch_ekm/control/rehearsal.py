@@ -30,7 +30,6 @@ _MOST = 60  # pieces
 LONGEST = 60 * DEGREE  # [rad] of an actuator in one movement: what follows is planned when it is there
 _BENDS = 0.25 * DEGREE  # of a piece beyond its linearization: it is chosen once more, about where it leads
 _HALVES = 3  # times that a piece is tried
-_DEVIATIONS = 2.0  # of servos' errors, that let no finger go
 _SOFTENS = 0.85  # of the stiffness without forces, below which a grasp is gripped no harder
 _FORCES = "mu", "force", "normal", "spin_moment"
 _GRIPPED = 0.95  # of the wanted grip
@@ -140,7 +139,7 @@ class Rehearsal:
             if seen.grip is not None:
                 seen = dataclasses.replace(seen, grip=min(seen.grip, self._most))
             decision = controller.choose(lin, seen)
-            if not any(lets_go(self.hand.hand, piece, _DEVIATIONS) for piece in decision.pieces):
+            if not any(lets_go(self.hand.hand, piece) for piece in decision.pieces):
                 break
             desired = desired / 2
         found = self.hand.tangent(decision.delta_a) if decision.status is StopReason.RUNNING else None

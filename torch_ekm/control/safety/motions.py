@@ -19,9 +19,8 @@ from .guards import Objection, check, deg
 from .readings import AGAINST, ReadingTests
 
 if TYPE_CHECKING:
-    from ...kinematics import ServoModel
-    from ...kinematics.servo_model import IdealServos
     from ...model import KinematicModel, Linearization
+    from ..knowledge import HandKnowledge
 
 _SURPRISE = 3.0  # [N] above the model: joints and springs are asked; a pad that reads none of it is dead
 _JOINT_STD = 0.75  # [N] of a normal force by joints and springs alone, beside its share
@@ -46,23 +45,21 @@ class MotionTests:
     Args:
         readings: tests and limits of single readings.
         model: f, with the hand.
-        servo: what is known of the servos.
-        usual: how many times what joints and springs give the fingertips read; None: not known yet.
+        knowledge: of the hand.
     """
 
     def __init__(
         self,
         readings: ReadingTests,
         model: KinematicModel,
-        servo: ServoModel | IdealServos,
-        usual: float | None = None,
+        knowledge: HandKnowledge,
     ) -> None:
         self.guards, self.readings, self.hand, self.model = readings.guards, readings, model.hand, model
-        self.servo, self.pads = servo, [pad.name for pad in model.hand.pads]
+        self.servo, self.pads = knowledge.servo, [pad.name for pad in model.hand.pads]
         self._least = model.options.forces.normal_std
         held = np.vstack([model.hand.actuation_jacobian, model.hand.coupling.reshape(-1, model.hand.n_q)])
         self._springs = bool(np.linalg.matrix_rank(held) < model.hand.n_q)
-        self._usual = usual
+        self._usual = knowledge.forces.usual
         self.times: float | None = None
         """The same in this grasp, before its grip has changed; None: joints and springs say nothing."""
         self._begun: Observation | None = None

@@ -11,6 +11,7 @@ import torch
 from ..._noise import NOISE
 from ...plant import Observation, PlantStatus
 from ...typing import Tensor
+from ..bands import DEVIATIONS
 from .guards import Guards
 
 if TYPE_CHECKING:
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from ..decision import Decision
 
-_DEVIATIONS = 2.0  # as far as the plan calls safe
 _RUNNING = 2  # frames that leave the band: one may be a wrong picture
 _SWINGS = math.radians(1.0)  # [rad] by which a moving object lags behind its equilibrium
 _FADES = 0.5  # of the force that was planned, below which a finger is about to let go
@@ -66,7 +66,7 @@ class OnTheWay:
             done, twist = self._off_path(seen)
             off, band = float(twist[-3:].norm()), self._band
             std = max(band.off_std, float(band.twist_std[-3:].max()))
-            self._off = self._off + 1 if off > _DEVIATIONS * done * std + _SWINGS else 0
+            self._off = self._off + 1 if off > DEVIATIONS * done * std + _SWINGS else 0
             if self._off >= _RUNNING:
                 self.why = f"the object is {math.degrees(off):.1f} deg off its path"
         return not self.why

@@ -19,9 +19,8 @@ from .motions import MotionTests
 from .readings import ReadingTests, agree
 
 if TYPE_CHECKING:
-    from ...kinematics import ServoModel
-    from ...kinematics.servo_model import IdealServos
     from ...model import KinematicModel
+    from ..knowledge import HandKnowledge
 
 _STILL = 0.05 * DEGREE  # an encoder that moves less stands
 _UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
@@ -51,8 +50,7 @@ class Watch:
         guards: limits.
         model: f, with the hand.
         tolerance: of the target [rad]; errors that grow by more are no noise.
-        servo: what is known of the servos.
-        usual: how many times what joints and springs give the fingertips read; None: not known yet.
+        knowledge: of the hand.
     """
 
     def __init__(
@@ -60,12 +58,11 @@ class Watch:
         guards: Guards,
         model: KinematicModel,
         tolerance: float,
-        servo: ServoModel | IdealServos,
-        usual: float | None = None,
+        knowledge: HandKnowledge,
     ) -> None:
         self.guards, self.hand = guards, model.hand
         self.readings = ReadingTests(guards, model.hand)
-        self.motions = MotionTests(self.readings, model, servo, usual)
+        self.motions = MotionTests(self.readings, model, knowledge)
         self.blind = 0
         """Motions in succession without a pose."""
         self.gated = 0

@@ -66,10 +66,8 @@ def direction_unmet(hand: HandDescription, pad: ContactPad) -> Unmet | None:
             continue
         if _closing(hand, joint) * along[joint] >= 0:
             return None
-        name, closes = (
-            hand.joint_names[joint],
-            (T[:3, :3].T @ (-np.sign(along[joint]) * velocity[joint])).round(4),
-        )
+        name = hand.joint_names[joint]
+        closes = (T[:3, :3].T @ (-np.sign(along[joint]) * velocity[joint])).round(4)
         return Unmet(
             f"pad '{pad.name}'",
             f"its direction {_text(pad.direction)} points away from where joint '{name}' closes it",
