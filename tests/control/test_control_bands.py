@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from obedient_plant import Obedient
 
 from torch_ekm.control import Bands, ClosedLoop, HandFigures, HandKnowledge, LookAndMoveController, PoseTarget
+from torch_ekm.control.bands import lets_go, servo_std
 from torch_ekm.control.model_error import STEADY, ModelError
 from torch_ekm.enhanced import EnhancedModel
 
@@ -78,6 +80,21 @@ def test_what_forces_may_be_grows_with_the_way_and_shrinks_with_evidence(held, p
     assert "+-" in str(found[-1])
     assert found[-1].force[:3].isfinite().all()
     assert found[-1].force[3:].isnan().all()  # pads that did not touch
+
+
+def test_only_servos_of_a_stiff_hand_let_a_finger_go(held, path, monkeypatch) -> None:
+    hand, piece = held[2].hand, path[4][0].piece
+    rows, pads = hand.pad_rows(piece.linearization.contacts.finger)
+    errs = servo_std(piece.linearization, piece.action, rows)
+    assert 0 < float(errs.max()) < 0.1  # the iCub's springs are soft [N]
+    opens = piece.force.clone()
+    opens[pads] = 0.0
+    assert not lets_go(hand, dataclasses.replace(piece, force=opens))  # the next look finds it
+    monkeypatch.setattr("torch_ekm.control.bands.servo_std", lambda *_: 20 * errs)
+    for share, loose in ((2.1, False), (1.9, True)):
+        force = piece.force.clone()
+        force[pads] = share * 20 * errs
+        assert bool(lets_go(hand, dataclasses.replace(piece, force=force))) is loose
 
 
 def test_errors_along_the_way_and_across_it_are_learned_apart() -> None:

@@ -184,6 +184,20 @@ def test_the_safer_the_model_the_farther_it_goes_at_once(held, target) -> None:
     assert safe[-1] < 4
 
 
+def test_a_waypoint_at_which_a_finger_may_slide_is_not_safe(held, loop, target) -> None:
+    plan = loop.plan(target)
+    first, last = plan.waypoints[0], plan.waypoints[1]
+    last = dataclasses.replace(last, band=dataclasses.replace(last.band, force=last.band.force + 3.0))
+    spare = first.piece.margin.new_full(first.piece.margin.shape, 10.0)
+    need = 2 * last.piece.linearization.contacts.friction.mean() * last.band.force_std
+    for share, safe in ((1.1, True), (0.9, False)):
+        piece = dataclasses.replace(last.piece, margin=share * need)
+        path = [first, dataclasses.replace(last, piece=piece)]
+        against = WholeTurn()._against(path, math.inf, spare)
+        assert ("slide" not in against) is safe
+        assert "slide" not in WholeTurn()._against(path, math.inf, 0.8 * need)  # it had none to spare
+
+
 def test_a_movement_is_no_longer_than_it_is_asked_to_be(loop, target) -> None:
     seen = loop.plant.observe()
     plan = WholeTurn().plan(loop.controller, seen, target, loop.knowledge, 0.0, whole=True, longest=8 * DEG)

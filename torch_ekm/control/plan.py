@@ -227,8 +227,8 @@ class WholeTurn:
             return f"a finger may keep only {float(low.min()):.1f} N"
         if piece.margin is None:
             return ""
-        # one deviation, for one finger that slides loses no object
-        least = torch.minimum(piece.linearization.contacts.friction.mean() * band.force_std, spare)
+        friction = piece.linearization.contacts.friction.mean()
+        least = torch.minimum(self.deviations * friction * band.force_std, spare)
         slides = (piece.margin < least) & ~band.force.isnan()
         return "a finger may slide" if bool(slides.any()) else ""
 
