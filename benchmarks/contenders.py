@@ -41,7 +41,7 @@ from torch_ekm.simulation.mechanism.assembly import true_hand, true_object
 _DEG = math.pi / 180
 _CAPACITY = 60  # basis vectors of the paper's learner, which gives no figure
 #: Nothing is gated or watched for; readings that cannot be are still refused.
-_NO_GUARDS = Guards(gate=math.inf, force_ceiling=math.inf, stuck_command=math.inf, wrong_way=10**6)
+_NO_GUARDS = Guards(gate=math.inf, force_ceiling=math.inf, stuck_command=math.inf)
 
 
 @dataclass(frozen=True)

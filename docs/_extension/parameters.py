@@ -23,7 +23,7 @@ GROUPS = {
         "torch_ekm.control",
         ["ActuatorLimit", "JointLimit", "NormalForceLimit"],
     ),
-    "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction", "StepBound"]),
+    "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction"]),
     "Plan": ("torch_ekm.control", ["WholeTurn"]),
     "Closed loop": ("torch_ekm.control", ["StoppingRule", "Guards"]),
     "Simulation": ("torch_ekm.simulation", ["PlantConfig", "ImageQuality"]),

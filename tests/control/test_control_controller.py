@@ -12,6 +12,7 @@ from torch_ekm.control import (
     DEFAULT_LIMITS,
     DEFAULT_TASKS,
     ActuatorLimit,
+    Direction,
     EffortTask,
     FocusedPose,
     FocusTask,
@@ -248,7 +249,7 @@ def test_no_contact_is_asked_to_travel_far(grasp) -> None:
 
 def test_a_translation_carries_every_contact_as_far(grasp) -> None:
     _, model, seen, state = grasp
-    focus = FocusedPose(torch.eye(6, dtype=torch.float64)[:3])
+    focus = FocusedPose([Direction(axis, "mm") for axis in torch.eye(3)])
     target = PoseTarget(state.position + torch.tensor([3e-3, 4e-3, 0.0]), state.rotation)
     short = LimitingFunction(step=1.0, contact_travel=0.5e-3)
     decision = LookAndMoveController(model, focus, limiting=short, bound=None).decide(state, seen.a, target)

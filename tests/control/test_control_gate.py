@@ -54,53 +54,7 @@ def turn(held, plant, angle: float = 20.0, learns: bool = True, **options) -> tu
     return loop, loop.run(PoseTarget.turned(seen.state, axis, degrees=angle))
 
 
-class Slipping(Obedient):
-    """The object truly turns 9 deg off its axis after the third motion: further looks are taken."""
-
-    about: torch.Tensor
-
-    def command(self, delta_a: torch.Tensor) -> Observation:
-        if len(self.given) == 2:
-            off = torch.cat([torch.zeros(len(self.start.q) + 3).double(), 9 * DEG * self.about])
-            self.state = self.state.plus(off)
-        return super().command(delta_a)
-
-
-def slipping(held, fault: Fault) -> Slipping:
-    seen, axis, model = held
-    other = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0]).double())
-    plant = Slipping(model, seen, fault, since=0)
-    plant.about = other / torch.linalg.vector_norm(other)
-    return plant
-
-
 # -- what is refused is seen by nobody ---------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("learns", [True, False])
-@pytest.mark.parametrize("look", range(1, 7))
-def test_an_encoder_that_is_wrong_in_one_look_moves_nothing_far_and_teaches_nothing(
-    held, look: int, learns: bool
-) -> None:
-    def glitch(plant: Obedient, seen: Observation) -> Observation:
-        if len(plant.given) != 3 or plant.looks != look:
-            return seen
-        return dataclasses.replace(seen, a=seen.a + 1.9 * (torch.arange(len(seen.a)) == 3))
-
-    knowledge = HandKnowledge.of(held[2].hand)
-    plant = slipping(held, glitch)
-    _, done = turn(held, plant, learns=learns, knowledge=knowledge)
-    if look != 3:  # the last look at the motion, whose pose is in doubt: then it ends by the encoder
-        blameless = (
-            Reason.REACHED,
-            Reason.GIVEN_UP,
-            Reason.UNSTABLE_GRASP,
-            Reason.STALLED,
-            Reason.ACTUATOR_LIMITS,
-        )
-        assert done.reason in blameless
-    assert max(float(v.abs().max()) for v in plant.given) < 16.5 * DEG  # of a step; the encoder says 109 deg
-    assert float(knowledge.servo.bias.abs().max()) < 0.05 * DEG
 
 
 def test_a_hand_that_is_well_again_turns_whatever_was_believed_of_its_servos(held) -> None:
@@ -172,14 +126,6 @@ def test_a_second_turn_at_the_same_time_is_refused(held, same_loop: bool) -> Non
         go_on.set()
         assert first.result(60).reason is Reason.REACHED
     assert other.run(target).reason is Reason.REACHED  # now it is free
-
-
-def test_a_turn_that_is_left_with_break_frees_the_hand(held) -> None:
-    plant = Obedient(held[2], held[0])
-    target = PoseTarget.turned(held[0].state, held[1], degrees=12)
-    for _ in loop_of(held, plant, learns=False).steps(target):
-        break
-    assert loop_of(held, plant, learns=False).run(target).reason is Reason.REACHED
 
 
 # -- sensors that lie --------------------------------------------------------------------------------------
@@ -296,7 +242,7 @@ def test_of_a_hand_that_is_well_nothing_is_said(held, learns: bool) -> None:
         plant = Obedient(held[2], held[0], dead_zone=1.3 * DEG)
         known = HandKnowledge.of(held[2].hand)
         _, done = turn(held, plant, angle, learns, knowledge=known, planner=None)
-        assert done.stop.message in ("", "link 'middle_2', which has no pad, bears on the object")
+        assert not done.stop.message
         assert not any(step.note for step in done.steps)
 
 
@@ -337,7 +283,7 @@ def test_what_was_learned_until_the_last_motion_is_there_and_the_hand_holds_firs
 
 
 WHY_NOT = {
-    "moved": (lambda plant: setattr(plant, "a", plant.a + 69 * DEG), "stands 69.0 deg from where it was"),
+    "moved": (lambda plant: setattr(plant, "a", plant.a + 69 * DEG), "stands 69 deg from where it was"),
     "lost": (lambda plant: vars(plant).update(fault=lost, since=0), "the object is lost"),
     "taken": (lambda plant: setattr(plant, "state", shifted(plant.state)), "173 mm and"),
 }
@@ -372,11 +318,11 @@ def test_what_another_learner_learned_is_refused_and_nothing_of_the_rest_is_take
     journal, loop = journal_of(held, tmp_path)
     ekm = EnhancedModel.for_grasp(held[2], held[0].state, RecursiveLeastSquares(26, 6))
     again = ClosedLoop(loop.plant.plant.plant, LookAndMoveController(ekm, held[1]))
-    before = again.learned.state()
+    before = copy.deepcopy(again.learned.state_dict())
     with pytest.raises(StateMismatchError):
         journal.resume(again)
-    after = again.learned.state()
-    assert all(torch.equal(value, after["knowledge"][name]) for name, value in before["knowledge"].items())
+    after = again.learned.state_dict()
+    assert all(torch.equal(value, after[name]) for name, value in before.items() if "knowledge" in name)
 
 
 def test_a_file_that_is_no_journal_is_refused(held, tmp_path) -> None:

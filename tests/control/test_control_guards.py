@@ -7,13 +7,11 @@ import math
 
 import pytest
 import torch
-from fuzzed_plant import FuzzedPlant
 from obedient_plant import Obedient, turned, watched
 
 from torch_ekm.control import (
     ClosedLoop,
     Guards,
-    HandKnowledge,
     LookAndMoveController,
     OneStep,
     PoseTarget,
@@ -24,7 +22,7 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.safety.readings import ReadingTests
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.plant import Observation, PlantStatus, PlantWrapper, ServoInverse, Stamps
+from torch_ekm.plant import Observation, PlantStatus, PlantWrapper, Stamps
 
 DEG = math.pi / 180
 SAFETY = Safety(rule=StoppingRule(max_steps=25))
@@ -86,18 +84,6 @@ def test_motion_that_nobody_saw_does_not_teach_and_neither_does_the_one_after_it
     off = run.plant.last  # what was passed on meanwhile: the old pose
     assert blind.status is PlantStatus.NOT_SEEN
     assert not torch.allclose(blind.rotation, off[-1].rotation)
-
-
-def test_a_repeated_pose_without_a_word_is_seen_by_its_stamp(held) -> None:
-    def silent(plant: Obedient, seen: Observation) -> Observation:
-        return (
-            dataclasses.replace(unseen(plant, seen), status=PlantStatus.HELD)
-            if plant.given[2:] == []
-            else seen
-        )
-
-    run = Run(held, silent)
-    assert run.taught[:4] == [True, False, False, True]
 
 
 def test_a_frame_that_is_missed_is_waited_for(held) -> None:
@@ -192,23 +178,6 @@ def test_an_object_that_goes_the_wrong_way_ends_the_loop_after_three_motions(hel
     assert len(done.steps) <= 4
     assert done.reason is Reason.WRONG_WAY
     assert "torch-ekm check --plant" in done.stop.message
-
-
-def test_a_turn_that_has_come_half_the_way_ends_without_blame_for_a_sign(held) -> None:
-    """From 6 deg on every motion lets the object slip back by half a degree more."""
-    seen, axis, _ = held
-    slid: list[bool] = []
-
-    def slips(plant: Obedient, now: Observation) -> Observation:
-        past = float(axis @ now.state.minus(seen.state)[-3:]) - 6 * DEG
-        slid.append(past > 0)
-        return turned(now, axis, -max(past, 0.0) - 0.5 * DEG * sum(slid))
-
-    run = Run(held, slips, angle=10.0, since=0)
-    errors = run.done.errors
-    assert max(errors) - min(errors) > 3 * DEG
-    assert errors[-1] > min(errors) + 3 * 0.25 * DEG  # it went away again and again
-    assert run.reason is not Reason.WRONG_WAY, run.message
 
 
 # -- every guard has a reason of its own -------------------------------------------------------------------
@@ -351,7 +320,7 @@ def test_a_fingertip_that_repeats_itself_is_frozen(held) -> None:
         force[0] = 4.0
         return dataclasses.replace(seen, fingertip_force=force)
 
-    run = Run(held, stuck, Guards(fingertip_repeats=3))
+    run = Run(held, stuck)
     assert "again and again" in "".join(step.note for step in run.done.steps)
     assert run.reason is Reason.REACHED
 
@@ -367,64 +336,8 @@ def test_a_goal_that_nobody_saw_is_not_reached(held) -> None:
     assert run.reason is Reason.BLIND
 
 
-def test_servo_inverse_learns_of_a_motion_when_its_reading_is_accepted(held) -> None:
-    seen, _, model = held
-    plant = ServoInverse(Obedient(model, seen), model.hand)
-    da = torch.full_like(seen.a, 0.02)
-    start = plant.command(da)
-    before = {name: value.clone() for name, value in plant.servo.named_buffers()}
-    after = plant.send(da, start, "turn")
-    plant.observe()
-    assert same(dict(plant.servo.named_buffers()), before)
-    plant.learn(after)
-    assert not same(dict(plant.servo.named_buffers()), before)
-
-
 def test_guards_have_limits_of_their_own() -> None:
     with pytest.raises(ParameterError, match="speed"):
         Guards(speed=0.0)
     with pytest.raises(ParameterError, match="max_age"):
         Guards(max_age=Stamps(0.1, 0.1, -1.0, 0.1))
-
-
-# -- and all of it at random -------------------------------------------------------------------------------
-
-
-def test_spoilt_readings_neither_break_the_limits_nor_what_is_learned(held) -> None:
-    """100 observations each, median of five seeds; 100,000 by ``benchmarks/gate.py``."""
-    seen, axis, model = held
-
-    def session(chance: float, observations: int, seed: int) -> tuple[Obedient, ClosedLoop]:
-        plant, ekm, done = Obedient(model, seen, noise=3e-3), EnhancedModel.for_grasp(model, seen.state), 0
-        controller = LookAndMoveController(ekm, axis)
-        loop = ClosedLoop(FuzzedPlant(plant, chance, seed=seed), controller, safety=SAFETY)
-        sight = loop.plant
-        while sight.observations < observations:
-            start = plant.reset(done)
-            target = PoseTarget.turned(start.state, axis, degrees=20 if done % 2 else -12)
-            for _ in range(5):
-                if loop.run(target).reason is Reason.REACHED:
-                    break
-                sight.repair()
-            done += 1
-        return plant, loop
-
-    def error(taught: EnhancedModel, knowledge: HandKnowledge) -> float:
-        """Of a clean turn without learning, as a share of its movements."""
-        plant, off, way = Obedient(model, seen, noise=1e-6), [], []
-        controller = LookAndMoveController(taught, axis)
-        start = plant.reset(99)
-        loop = ClosedLoop(plant, controller, knowledge=knowledge, safety=SAFETY, learn=False)
-        for step in loop.run(PoseTarget.turned(start.state, axis, degrees=15)).steps:
-            expected = controller.expect(step.decision.pieces, step.after.a - step.before.a)
-            off.append((expected.increment - step.increment)[-3:])
-            way.append(step.increment[-3:])
-        return float(torch.stack(off).norm() / torch.stack(way).norm())
-
-    errors = []
-    for seed in range(4, 9):
-        plant, fuzzed = session(0.15, observations=100, seed=seed)
-        assert float(torch.stack(plant.given).abs().max()) <= Guards().increment + 1e-9
-        errors.append(error(fuzzed.controller.enhanced, fuzzed.knowledge))
-    nothing = EnhancedModel.for_grasp(model, seen.state), HandKnowledge.of(model.hand)
-    assert sorted(errors)[2] < 0.6 * error(*nothing)

@@ -98,34 +98,6 @@ def test_a_state_with_nan_is_refused_and_nothing_is_changed(driven, spoilt) -> N
     assert torch.equal(knowledge.figures.mean, driven.knowledge.figures.mean)
 
 
-def test_what_motions_taught_can_be_taken_back(driven) -> None:
-    knowledge, n_a = HandKnowledge.of(driven.controller.kinematic.hand), 9
-    states = []
-    for motion in range(12):
-        states.append({name: value.clone() for name, value in knowledge.state_dict().items()})
-        knowledge.checkpoint()
-        knowledge.servo.update(*torch.full((2, n_a), 0.01 * (motion + 1), dtype=torch.float64))
-        knowledge.forces.update(torch.full((n_a,), 0.01), torch.ones(5), torch.ones(5), 0.1)
-        knowledge.error.square.fill_(0.01 * motion)
-
-    def as_before(motion: int) -> bool:
-        now = knowledge.state_dict()
-        return all(torch.equal(now[name], value) for name, value in states[motion].items())
-
-    assert knowledge.take_back() == 1
-    assert as_before(11)
-    assert not as_before(10)
-    assert knowledge.take_back(3) == 3
-    assert as_before(8)
-    assert knowledge.take_back(100) == 4
-    assert as_before(4)
-    assert knowledge.take_back() == 0
-    assert as_before(4)
-    knowledge.checkpoint()
-    knowledge.load_state_dict(knowledge.state_dict())
-    assert knowledge.take_back() == 0  # of another state
-
-
 IMPOSSIBLE = {  # entry, an index, and a value that no estimator comes to
     "bias": ("servo.estimate", (0, 1), 0.2),
     "dead zone": ("servo.estimate", (3, 0), 0.2),

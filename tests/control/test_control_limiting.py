@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from torch_ekm.control import GripForceTask, LookAndMoveController, PoseTarget, Situation, StepBound
-from torch_ekm.control.limiting import grip_share
-from torch_ekm.exceptions import ParameterError
+from torch_ekm.control.decision import Grip
 
 DEG = math.pi / 180
 
@@ -38,30 +37,37 @@ def test_the_grip_follows_from_weight_friction_and_lever(pinch) -> None:
 
 def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(pinch) -> None:
     plant, model, seen = pinch
-    controller = LookAndMoveController(model, plant.rotation_axis)
-    lin, focus = model.linearize(seen.state), controller.focus
+    controller = LookAndMoveController(model, plant.rotation_axis, bound=None)
+    focus, target = controller.focus, PoseTarget.turned(seen.state, plant.rotation_axis, degrees=5.0)
+    step = controller.decide(seen.state, seen.a, target)
+    lin = step.linearization
     on = torch.zeros(6, dtype=torch.float64)
     at = Situation(plant.hand, focus, seen.state, seen.a, None, on, torch.zeros(1), weight=0.8)
-    still, bound = torch.zeros(plant.hand.n_a, dtype=torch.float64), StepBound()
-    predicted = torch.zeros(plant.hand.n_q + 6, dtype=torch.float64)
-    assert bound.share(lin, still, predicted, at) == 1.0
-    turned, carried = predicted.clone(), predicted.clone()
-    turned[-6:] = 3 * DEG * focus.off_matrix[~focus.off_translation][0]
-    assert bound.share(lin, still, turned, at) == pytest.approx(0.5)
-    carried[-6:] = 10e-3 * focus.off_matrix[focus.off_translation][0]
-    shares = [bound.share(lin, still, carried, at, asked) for asked in (0.3, 0.5, 1.0, 2.0)]
+    firm = Grip(torch.ones(3), torch.ones(3), 1.0)
+
+    def share(delta_a=None, off=on, asked: float = 1.0, seen: Situation = at, grip: Grip = firm) -> float:
+        still = torch.zeros(plant.hand.n_a, dtype=torch.float64) if delta_a is None else delta_a
+        predicted = torch.cat([torch.zeros(plant.hand.n_q, dtype=torch.float64), off])
+        decided = dataclasses.replace(step, delta_a=still, predicted=predicted, grip=grip)
+        return StepBound().share(decided, seen, asked)
+
+    assert share() == 1.0
+    assert share(off=3 * DEG * focus.off_matrix[~focus.off_translation][0]) == pytest.approx(0.5)
+    carried = 10e-3 * focus.off_matrix[focus.off_translation][0]
+    shares = [share(off=carried, asked=asked) for asked in (0.3, 0.5, 1.0, 2.0)]
     assert shares == pytest.approx([1.0, 0.7, 0.35, 0.25])  # none below 0.35 of the largest step
     slides = -lin.margin_sensitivity[0]
     slides *= 40.0 / float(slides.square().sum())  # [N] that the margin falls by
-    assert bound.share(lin, slides, predicted, at, 2.0) < 1.0
-    force = float(at.normal_force(lin).max())  # type: ignore[union-attr]
-    grips = [dataclasses.replace(at, grip=force / part) for part in (1.2, 0.75, 0.65, 0.55, 0.3)]
-    assert [grip_share(lin, one) for one in grips] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
-    assert grip_share(lin, at) == 1.0  # nothing is asked of it
+    assert share(slides, asked=2.0) < 1.0
+    grips = [firm._replace(wanted=wanted) for wanted in (1 / 1.2, 1 / 0.75, 1 / 0.65, 1 / 0.55, 1 / 0.3, 0.0)]
+    assert [grip.bears for grip in grips] == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0, 1.0])
+    assert [bool(grip.waits) for grip in grips] == [False, False, True, True, True, False]
+    felt = dataclasses.replace(at, fingertip_force=seen.fingertip_force)
+    assert [share(seen=one, grip=grips[3]) for one in (at, felt)] == [0.35, 0.0]  # an estimate does not wait
     # a motion that takes the margins away: the heavier the object, the less of it is made
     delta = 4 * DEG * torch.from_numpy(np.sign(lin.margin_sensitivity.sum(0).numpy())) * -1.0
     heavier = [dataclasses.replace(at, weight=weight) for weight in (0.3, 3.0)]
-    shares = [bound.share(lin, delta, predicted, one, 10.0) for one in heavier]
+    shares = [share(delta, asked=10.0, seen=one) for one in heavier]
     assert 0 < shares[1] < shares[0] < 1
 
 
@@ -73,21 +79,3 @@ def test_a_measured_grip_that_is_too_weak_is_tightened_and_not_turned(pinch) -> 
     assert 0.0 < float(decision.desired.norm()) < 0.3 * DEG
     change = decision.linearization.normal_force_sensitivity @ decision.delta_a
     assert float(change[0]) > 0.3  # [N]
-
-
-def test_the_bound_shortens_the_step_that_is_made(pinch) -> None:
-    plant, model, seen = pinch
-    target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=20.0)
-    whole, cut = (
-        LookAndMoveController(model, plant.rotation_axis, bound=bound).decide(
-            seen.state, seen.a, target, seen.fingertip_force
-        )
-        for bound in (None, StepBound(off_travel=1e-5))
-    )
-    size = float(whole.desired.norm()) / (2.5 * DEG)
-    torch.testing.assert_close(cut.desired, StepBound().least / size * whole.desired, rtol=1e-6, atol=0)
-
-
-def test_figures_outside_their_range_are_refused() -> None:
-    with pytest.raises(ParameterError, match="creep"):
-        StepBound(creep=0.0)

@@ -11,6 +11,7 @@ import torch
 
 from torch_ekm.control import (
     ClosedLoop,
+    Direction,
     FocusedPose,
     ForceSensitivity,
     LookAndMoveController,
@@ -133,7 +134,7 @@ def test_what_cannot_be_asked_is_refused(grasp) -> None:
     with pytest.raises(NoContactError):
         ClosedLoop(away, controller).reach()
     whole = copy.copy(controller)
-    whole.focus = FocusedPose(torch.eye(6, dtype=torch.float64))
+    whole.focus = FocusedPose([Direction(axis, "mm") for axis in torch.eye(3)])
     with pytest.raises(ParameterError, match="one axis"):
         ClosedLoop(plant, whole).reach()
 

@@ -28,7 +28,7 @@ DEG = math.pi / 180
 
 
 def watch_of(model) -> Watch:
-    return Watch(Guards(), model, 0.0, HandKnowledge.of(model.hand, learns=False))
+    return Watch(Guards(), model, HandKnowledge.of(model.hand, learns=False))
 
 
 def run(held, fault: Fault, since: int) -> Manipulation:
@@ -121,6 +121,6 @@ def test_joints_that_say_nothing_of_forces_do_not_contradict_the_fingertips(
     held, monkeypatch: pytest.MonkeyPatch, by_joints: float, told: bool
 ) -> None:
     """Joints without springs behind rigid motors give next to nothing, whatever the pads press with."""
-    tests = watch_of(held[2]).motions
+    tests = watch_of(held[2]).fingertips
     monkeypatch.setattr(tests, "_by_joints", lambda seen: {0: by_joints, 1: by_joints})
     assert bool(tests._scale(held[0], torch.full((5,), 4.0, dtype=torch.float64))) is told

@@ -6,14 +6,14 @@ from ..estimation.force_sensitivity import ForceSensitivity
 from ..estimation.hand_figures import DescribedFigures, HandFigures
 from .bands import Bands
 from .closed_loop import ClosedLoop
-from .controller import DEFAULT_LIMITS, DEFAULT_TASKS, LookAndMoveController
+from .controller import LookAndMoveController
 from .decision import Band, Decision, Piece, StopReason
 from .ends import Safety, StoppingRule
 from .focus import Direction, FocusedPose, PoseTarget
 from .journal import Journal
 from .knowledge import HandKnowledge
 from .limiting import LimitingFunction, StepBound
-from .limits import ActuatorLimit, JointLimit, Limit, NormalForceLimit
+from .limits import DEFAULT_LIMITS, ActuatorLimit, JointLimit, Limit, NormalForceLimit
 from .manipulation import Manipulation, Step, Stop
 from .model_hand import ModelHand
 from .plan import OneStep, Plan, Planner, Waypoint, WholeTurn
@@ -22,7 +22,7 @@ from .reach import Reach, Reachability
 from .rehearsal import End, PathEnd
 from .safety import Guards
 from .situation import LinearizedModel, Situation
-from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
+from .tasks import DEFAULT_TASKS, EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 
 __all__ = [
     "DEFAULT_LIMITS",

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import math
 import threading
 import time
 from collections.abc import Generator
 
 import torch
+from torch import nn
 
 from .._checks import check_kind
 from .._extras import require
 from ..estimation.hand_figures import DescribedFigures, HandFigures
-from ..exceptions import StateError
+from ..exceptions import NoStateError, StateError
 from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
 from ..plant.frames_at_rest import mean_reading
 from ..residual.sparse_gp.engine.loading import load_loops
@@ -23,12 +25,11 @@ from .decision import Decision, Expectation, StopReason
 from .ends import Ends, Safety, failed
 from .focus import PoseTarget
 from .knowledge import HandKnowledge
-from .learned import Learned
 from .lessons import Lessons
 from .manipulation import Manipulation, Step, Stop
 from .plan import OneStep, Plan, Planner, WholeTurn
 from .reach import Reach, Reachability, reach, reachability
-from .safety.guards import Objection
+from .safety.guards import Objection, gravest
 from .safety.on_the_way import OnTheWay
 from .safety.watch import Watch
 
@@ -96,7 +97,12 @@ class ClosedLoop:
         guards = self.safety.guards
         self._gate = Gate(plant, hand, increment=guards.increment, speed=guards.speed)
         self.plant, self.knowledge = ServoInverse(self._gate, hand, knowledge.servo), knowledge
-        self.learned = Learned(knowledge, controller)
+        self.learned = nn.ModuleDict({"knowledge": knowledge})
+        """All that it learns; a learner without a state is left out."""
+        if controller.enhanced is not None:
+            with contextlib.suppress(NoStateError):
+                controller.enhanced.learner.state_dict()
+                self.learned["learner"] = controller.enhanced.learner
         self._lessons = Lessons(controller, knowledge, self._figures)
         self._stop = threading.Event()
         require("qpsolvers")  # now, not within the first movement; so with the learner's loops
@@ -129,8 +135,11 @@ class ClosedLoop:
 
         Nothing moves, and nothing is learned.
         """
+        return self._planned(self.plant.observe(), target)
+
+    def _planned(self, seen: Observation, target: PoseTarget) -> Plan:
         planner = self.planner if isinstance(self.planner, WholeTurn) else WholeTurn()
-        return planner.plan(self.controller, self.plant.observe(), target, self.knowledge, 0.0, whole=True)
+        return planner.plan(self.controller, seen, target, self.knowledge, 0.0, whole=True)
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
         """``max |angle|`` of a :meth:`plan` about the focused axis: how far the model turns the object, and
@@ -151,7 +160,7 @@ class ClosedLoop:
 
     def reachability(self, target: PoseTarget) -> Reachability:
         """Whether the motors can bring the object to ``target``: rank and conditioning of the focused rows of
-        J_m, ranges of the motors, rotation off the focus. To first order: without slip and links that touch.
+        J_m, and the ranges of the motors. To first order: without slip and links that touch.
 
         Raises:
             GraspError: the model refuses the grasp as it is.
@@ -177,15 +186,14 @@ class ClosedLoop:
         with self._gate.owned():
             self._stop.clear()
             self._gate.last = self._gate.failure = None
-            known = self.learned.state()
+            known = copy.deepcopy(self.learned.state_dict())
             try:
-                rule, guards = self.safety.rule, self.safety.guards
-                watch = Watch(guards, controller.kinematic, rule.tolerance, self.knowledge)
+                watch = Watch(self.safety.guards, controller.kinematic, self.knowledge)
                 stop = yield from self._movements(target, watch)
                 if watch.lie or stop.reason is StopReason.WRONG_WAY:
-                    self.learned.restore(known)
-                if self.learn and controller.enhanced is not None and watch.motions.times is not None:
-                    self.knowledge.forces.grasped(watch.motions.times)  # also of pads that seem to lie
+                    self.learned.load_state_dict(known)
+                if self.learn and controller.enhanced is not None and watch.fingertips.times is not None:
+                    self.knowledge.forces.grasped(watch.fingertips.times)  # also of pads that seem to lie
                 return stop.told(watch.lie or watch.doubt)
             except (Exception, KeyboardInterrupt) as error:
                 last, failure = self._gate.last, self._gate.failure
@@ -213,11 +221,15 @@ class ClosedLoop:
                 self.hold()
                 return Stop(halt.reason, seen, halt.message)
             seen, looks = self._look(seen, ends, watch)
-            over = ends.over(seen, looks, decision, self._stop.is_set(), self.decline)
+            over = ends.over(seen, looks, self._stop.is_set(), self.decline and decision is None)
             if over is not None:
                 if over.reason is StopReason.OBJECT_LOST:
                     self.knowledge.error.slid(lost=True)
-                return Stop(over.reason, seen, over.message)
+                why = over.message
+                if over.reason is StopReason.STALLED:
+                    grip = None if decision is None else decision.grip
+                    why = (grip and grip.waits) or self._planned(seen, target).end.message
+                return Stop(over.reason, seen, why)
             began = time.perf_counter()
             if turns:
                 firm = _LEAST if grips < _AGAIN and decision is not None and decision.turns else 0.0
@@ -226,9 +238,9 @@ class ClosedLoop:
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
-                said = "; ".join(filter(None, (decision.message, plan.end.message)))
-                return Stop(decision.status, seen, said + ends.surprise + watch.motions.suspects(seen))
-            halt = watch.command(decision, seen, first=decision.turns and not turns)
+                said = decision.message, plan.end.message, ends.surprise, watch.motions.suspects(seen)
+                return Stop(decision.status, seen, "; ".join(dict.fromkeys(filter(None, said))))
+            halt = gravest(watch.fingertips.before(decision, seen, first=decision.turns and not turns))
             if halt is not None:
                 continue
             step, halt = self._move(seen, decision, ends, watch, seconds)
@@ -267,9 +279,7 @@ class ClosedLoop:
         increment, pull = after.state.minus(seen.state), after.a - seen.a
         if halt is None and after.status is not PlantStatus.LOST:  # else nobody learns from this reading
             moved = pull
-            self.knowledge.checkpoint()
-            if verdict.encoders:
-                self.plant.learn(after)
+            self.plant.learn(after)
             halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
             if expected is not None and after.status is PlantStatus.HELD and self.learn:
                 if seen.status is PlantStatus.HELD:  # both ends were measured
@@ -282,7 +292,6 @@ class ClosedLoop:
                 ends.add(after, decision.limited)
                 if watch.gated and expected is not None and not (watch.blind or watch.slid):
                     ends.leapt(float((increment - expected.increment)[-3:].norm()), verdict.note)
-                halt = halt or watch.way(ends.errors, decision, moved)
         seconds += time.perf_counter() - began
         note = "; ".join(filter(None, (stopped, verdict.note)))
         return Step(seen, decision, after, increment, pull, report, seconds, note), halt

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -16,30 +17,22 @@ from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, S
 from ..kinematics import GraspState
 from ..model import ContactMotion, KinematicModel, ModelStatus
 from ..typing import Float, Tensor
-from .decision import Decision, Expectation, Grip, Piece, StopReason, shares
+from .decision import Decision, Expectation, Grip, Piece, StopReason, made_of, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
 from .limiting import LimitingFunction, StepBound, contact_travel
-from .limits import ActuatorLimit, JointLimit, KeepsForce, Limit, NormalForceLimit
+from .limits import DEFAULT_LIMITS, Limit
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
 from .situation import LinearizedModel, Situation
-from .tasks import EffortTask, FocusTask, GripForceTask, OffAxisTask, Task, WantsGrip
+from .tasks import DEFAULT_TASKS, Task
 
 if TYPE_CHECKING:
     from ..estimation.force_sensitivity import ForceSensitivity
     from ..model import Linearization
     from ..model.linearization import FollowedFigures
 
-#: What a step should do by default: effort, off-axis motion, grip force, focus. The figures suit the iCub
-#: hand.
-DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(), FocusTask())
-#: What a step must not do by default: limits of actuators, normal forces and joints.
-DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointLimit())
-
-DEFAULT_BOUND = StepBound()
-
+_BOUND = StepBound()
 _LIST = "a list of objects with a method rows(model, seen)"
 
-_STOPPED = 0.9  # of a movement: what falls shorter was stopped, and servos do not explain it
 # of the SQP for a model that is not linear in the action
 _ITERATIONS = 6
 _DAMPING = 0.6  # share of each change that is made
@@ -81,7 +74,7 @@ class LookAndMoveController:
         limits: Sequence[Limit] | None = None,
         *,
         limiting: LimitingFunction | None = None,
-        bound: StepBound | None = DEFAULT_BOUND,
+        bound: StepBound | None = _BOUND,
     ) -> None:
         self.kinematic, self.enhanced = kinematic_and_enhanced(model)
         check_kind(
@@ -100,8 +93,8 @@ class LookAndMoveController:
         for part in (*self.tasks, *self.limits):
             if isinstance(part, type) or not callable(getattr(part, "rows", None)):
                 raise ParameterError("tasks, limits", part, _LIST)
-        self._wanted = next((t.wanted for t in self.tasks if isinstance(t, WantsGrip)), None)
-        self._least = next((x.least for x in self.limits if isinstance(x, KeepsForce)), None)
+        self._wanted = next(filter(None, (getattr(one, "wanted", None) for one in self.tasks)), None)
+        self._least = next(filter(None, (getattr(one, "least", None) for one in self.limits)), None)
         self._weight = float(torch.linalg.vector_norm(self.kinematic.weight))
         self.previous: tuple[Linearization, Tensor] | None = None
         """The last linearization of this grasp whose forces were found, and the encoders there."""
@@ -121,7 +114,7 @@ class LookAndMoveController:
 
         What they did otherwise is spread over the pieces as their ways are.
         """
-        pieces = _made(pieces, moved)
+        pieces = made_of(pieces, moved)
         extra = moved - sum(one.action for one in pieces)
         start = f = both = pieces[0].state
         deviation, made, last = torch.zeros_like(pieces[0].nominal), [], pieces[-1]
@@ -133,15 +126,16 @@ class LookAndMoveController:
                 g, variance = self.enhanced.correction(one.state, w, len(nominal))
                 deviation = deviation + variance.sqrt()  # g errs alike along a path
             f, both = f.plus(nominal), both.plus(nominal + g)
-            said = None if one.said is None else one.said + self._said(one.linearization, part)
-            made.append(Piece(one.linearization, w, nominal, nominal + g, one.force, said))
+            lin = one.linearization
+            said = self._of_pads(lin, lin.described_normal_sensitivity @ part, 0.0)
+            said = None if one.said is None else one.said + said
+            made.append(Piece(lin, w, nominal, nominal + g, one.force, said))
         nominal, increment = made[0].nominal, made[0].increment
         if len(made) > 1:
             nominal, increment = f.minus(start), both.minus(start)
-        normal = None if last.force is None else last.force.clone()
+        lin, normal = last.linearization, last.force
         if normal is not None:
-            rows, pads = self.kinematic.hand.pad_rows(last.linearization.contacts.finger)
-            normal[pads] += (last.linearization.normal_force_sensitivity @ extra)[rows]
+            normal = normal + self._of_pads(lin, lin.normal_force_sensitivity @ extra, 0.0)
         return Expectation(moved, nominal, increment, deviation, tuple(made), normal)
 
     def went(self, a: Float[Tensor, " n_a"], pieces: Sequence[Piece]) -> None:
@@ -180,16 +174,6 @@ class LookAndMoveController:
         corrected[rows] = self.forces.corrected(corrected[rows], pads)
         return lin.with_normal_sensitivity(corrected)
 
-    def _joint_force(self, lin: Linearization) -> Tensor | None:
-        """Normal forces without the pads', where these leave a torque of the joints unexplained."""
-        if all(doubt.kind is not ModelStatus.UNEXPLAINED_TORQUE for doubt in lin.doubts):
-            return None
-        try:
-            forces = self.kinematic.linearize(lin.state, lin.contacts).forces
-        except GraspError:
-            return None
-        return forces.normal if forces.solved else None
-
     def decide(
         self,
         state: GraspState,
@@ -216,7 +200,7 @@ class LookAndMoveController:
             EKMError: what the tasks and limits raise.
         """
         force = self.believed(a, fingertip_force)
-        error = self._error(state, target)
+        error = check_kind("target", target, PoseTarget, A_TARGET).error(state)
         focused = self.focus.matrix @ error
         try:
             lin = self.linearize(state, a, force)
@@ -237,7 +221,7 @@ class LookAndMoveController:
         asked = self.limiting.steps(
             scale * desired, travel * float(desired.norm() / focused.norm().clamp(1e-12))
         )
-        phi = self.bound.share(lin, decision.delta_a, decision.predicted, seen, asked)
+        phi = self.bound.share(decision, seen, asked)
         return decision if phi == 1 else self.choose(lin, dataclasses.replace(seen, desired=phi * desired))
 
     def believed(self, a: Tensor, fingertip_force: Tensor | None) -> Tensor | None:
@@ -257,13 +241,6 @@ class LookAndMoveController:
         force = fingertip_force.where(fingertip_force.abs() >= least, torch.nan)
         return None if bool(force.isnan().all()) else force
 
-    def _error(self, state: GraspState, target: PoseTarget) -> Tensor:
-        """e, the twist to the target."""
-        error = check_kind("target", target, PoseTarget, A_TARGET).error(state)
-        check_shape("target", error, (6,))
-        check_finite("target", error)
-        return error
-
     def situation(
         self,
         lin: Linearization,
@@ -280,7 +257,11 @@ class LookAndMoveController:
             desired: dx_d.
         """
         hand = self.kinematic.hand
-        alone = None if force is None else self._joint_force(lin)
+        alone = None  # without the pads, where these leave a torque of the joints unexplained
+        if force is not None and any(one.kind is ModelStatus.UNEXPLAINED_TORQUE for one in lin.doubts):
+            with contextlib.suppress(GraspError):
+                forces = self.kinematic.linearize(lin.state, lin.contacts).forces
+                alone = forces.normal if forces.solved else None
         seen = Situation(
             hand, self.focus, lin.state, a, force, error, desired, alone, self._weight, self.tighter
         )
@@ -301,30 +282,24 @@ class LookAndMoveController:
         slack = float(np.abs(solution.slack).max(initial=0.0))
         asked = float((self.focus.tolerance_scale * seen.desired).abs().max())
         limited = slack > 0.05 * asked and self._at_limit(seen.a, da, problem)
-        force = self._force_after(lin, seen, da)
-        piece = Piece(lin, da, lin.step(da), predicted, force, self._said(lin, da))
+        said = self._of_pads(lin, lin.described_normal_sensitivity @ da, 0.0)
+        force = seen.normal_force(lin)
+        if force is not None:
+            force = torch.from_numpy(force + (0.0 if seen.drift is None else seen.drift))
+            force = self._of_pads(lin, force + lin.normal_force_sensitivity @ da, torch.nan)
+        piece = Piece(lin, da, lin.step(da), predicted, force, said)
         return Decision(
             da, StopReason.RUNNING, seen.desired, predicted, lin.described_jacobian @ da, (piece,), limited,
             slack, grip=self.grip(lin, seen),
         )  # fmt: skip
 
-    def _said(self, lin: Linearization, w: Tensor) -> Tensor:
-        """Change of each pad's force by the model alone, to first order; 0 where none touches [N]."""
-        said = w.new_zeros(len(self.kinematic.hand.pads))
+    def _of_pads(self, lin: Linearization, values: Tensor, nothing: float) -> Tensor:
+        """What is known of the contacts, of each pad of the hand ``(n_pads,)``; ``nothing`` where it does not
+        touch."""
         rows, pads = self.kinematic.hand.pad_rows(lin.contacts.finger)
-        said[pads] = (lin.described_normal_sensitivity @ w)[rows]
-        return said
-
-    def _force_after(self, lin: Linearization, seen: Situation, da: Tensor) -> Tensor | None:
-        """Normal force of each pad after an increment [N], NaN of one that does not touch; None: unknown."""
-        f_n = seen.normal_force(lin)
-        if f_n is None:
-            return None
-        rows, pads = seen.hand.pad_rows(lin.contacts.finger)
-        force = da.new_full((len(seen.hand.pads),), torch.nan)
-        drift = 0.0 if seen.drift is None else seen.drift
-        force[pads] = (torch.from_numpy(f_n + drift) + lin.normal_force_sensitivity @ da)[rows]
-        return force
+        found = values.new_full((len(self.kinematic.hand.pads),), nothing)
+        found[pads] = values[rows]
+        return found
 
     def grip(self, lin: Linearization, seen: Situation) -> Grip | None:
         """What the fingers bear and should bear; None where nothing is known or asked of it."""
@@ -357,11 +332,9 @@ class LookAndMoveController:
             da = best if done else da + _DAMPING * change
             if done:
                 break
-        predicted = model.offset + model.jacobian @ da
-        if enhanced is not None and not linear:
-            predicted = enhanced.linearize(seen.state, da, lin.manipulation_jacobian)[0]
-            predicted = predicted if seen.bend is None else predicted + seen.bend
-        return da, predicted, problem, solution
+        if not linear:
+            model = LinearizedModel.about(da, lin, enhanced, seen.bend)
+        return da, model.offset + model.jacobian @ da, problem, solution
 
     def _at_limit(self, a: Tensor, da: Tensor, problem: ControlProblem) -> bool:
         """An actuator that may move ends at the end of its range."""
@@ -369,14 +342,3 @@ class LookAndMoveController:
         lower, upper = problem.bounds
         at_end = (after <= hand.actuator_lower + margin) | (after >= hand.actuator_upper - margin)
         return bool((at_end & ((lower != 0) | (upper != 0))).any())
-
-
-def _made(pieces: Sequence[Piece], moved: Tensor) -> Sequence[Piece]:
-    """The pieces that a movement came to before it was stopped, the last one in part."""
-    ends = torch.stack([one.action for one in pieces]).cumsum(0)
-    size = (ends[-1] @ ends[-1]).clamp(min=1e-12)
-    done, along = float(moved @ ends[-1] / size), (ends @ ends[-1] / size).tolist()
-    if done > _STOPPED or len(pieces) == 1:
-        return pieces
-    k = next((i for i, end in enumerate(along) if end >= done), len(pieces) - 1)
-    return pieces[: k + 1]

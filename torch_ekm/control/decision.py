@@ -17,6 +17,9 @@ from ..typing import Float, Tensor
 if TYPE_CHECKING:
     from ..model import Linearization
 
+_STOPPED = 0.9  # of a movement: what falls shorter was stopped, and servos do not explain it
+_WEAK, _FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
+
 
 class StopReason(Enum):
     """Why a manipulation ended; ``RUNNING`` while it has not."""
@@ -41,9 +44,8 @@ class StopReason(Enum):
     COMMAND_REFUSED = "command refused"
     """By the :class:`~torch_ekm.plant.Gate` or the driver, before anything moved: see ``Stop.cause``."""
     WRONG_WAY = "wrong way"
-    """See :attr:`~torch_ekm.control.Guards.wrong_way`."""
-    STALE_SENSOR = "stale sensor"
     """This and what follows: see :class:`~torch_ekm.control.Guards`."""
+    STALE_SENSOR = "stale sensor"
     BLIND = "object not seen"
     ENCODER_JUMP = "encoder jump"
     ENCODER_DRIFT = "encoder drift"
@@ -70,6 +72,19 @@ class Grip(NamedTuple):
     def weak(self) -> bool:
         """Some finger bears less than it should."""
         return bool((self.force < self.least).any())
+
+    @property
+    def bears(self) -> float:
+        """``clip((f/f_wanted - 0.55) / 0.2, 0, 1)``: the share of a step that it bears."""
+        held = float(self.force.max()) / self.wanted if self.wanted else math.inf
+        return min(max((held - _WEAK) / (_FIRM - _WEAK), 0.0), 1.0)
+
+    @property
+    def waits(self) -> str:
+        """Why it cuts steps; empty: it does not."""
+        most = float(self.force.max())
+        why = f"turning waits for a grip of {self.wanted:.1f} N, and no finger bears more than {most:.1f} N"
+        return why if self.bears < 1 else ""
 
 
 @dataclass(frozen=True)
@@ -184,3 +199,14 @@ def shares(pieces: Sequence[Piece]) -> list[float]:
     """Of the way of the tendons, that each piece is."""
     way = torch.stack([one.action.norm() for one in pieces])
     return (way / way.sum()).tolist() if bool(way.any()) else [1 / len(pieces)] * len(pieces)
+
+
+def made_of(pieces: Sequence[Piece], moved: Tensor) -> Sequence[Piece]:
+    """The pieces that a movement came to before it was stopped, the last one in part."""
+    ends = torch.stack([one.action for one in pieces]).cumsum(0)
+    size = (ends[-1] @ ends[-1]).clamp(min=1e-12)
+    done, along = float(moved @ ends[-1] / size), (ends @ ends[-1] / size).tolist()
+    if done > _STOPPED or len(pieces) == 1:
+        return pieces
+    k = next((i for i, end in enumerate(along) if end >= done), len(pieces) - 1)
+    return pieces[: k + 1]

@@ -7,23 +7,19 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from .._checks import check_kind
-from .._noise import DEGREE, NOISE
+from .._noise import DEGREE
 from ..exceptions import CommandRefusedError, ParameterError
-from ..model import ModelStatus
 from ..plant import Observation, PlantStatus
-from .decision import Decision, StopReason
+from .decision import StopReason
 from .focus import A_TARGET, PoseTarget
-from .limiting import FIRM
 from .manipulation import Stop
 from .reach import out_of_reach
 from .safety.guards import Guards, Objection
 
 if TYPE_CHECKING:
-    from ..model import KinematicModel
     from .controller import LookAndMoveController
 
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
-_AT_STOP = math.radians(0.5)  # a joint as near to the end of its range stands there
 
 
 @dataclass(frozen=True)
@@ -92,10 +88,8 @@ class Ends:
 
     limited = False
     """The last movement was cut short by an actuator's limit."""
-    leap = ""
-    """The largest turn of the object that no motion explains, of those that were believed."""
     surprise = ""
-    """The first reading that was believed though no motion explains it."""
+    """The first reading that was believed though no motion explains it, or the one with the largest leap."""
 
     def __init__(
         self, rule: StoppingRule, target: PoseTarget, controller: LookAndMoveController, seen: Observation
@@ -104,21 +98,19 @@ class Ends:
         self.rule, self.target, self._controller, self._start = rule, target, controller, seen.state
         self.errors = [self.error(seen)]
         """|e| before each movement and after the last, as a turn [rad]."""
+        self._leap = 0.0  # [rad] of the surprise
 
     def error(self, seen: Observation) -> float:
         """|e| as a turn [rad]."""
         return self._controller.focus.error(self.target, seen.state)
 
-    def over(
-        self, seen: Observation, looks: int, last: Decision | None, stopped: bool, decline: bool
-    ) -> Objection | None:
+    def over(self, seen: Observation, looks: int, stopped: bool, declines: bool) -> Objection | None:
         """Why the manipulation ends before the next movement; None: it goes on.
 
         Args:
             looks: readings at rest of which ``seen`` is the mean.
-            last: the decision on the last movement; None: nothing has moved.
             stopped: somebody has asked for the end.
-            decline: a target out of reach ends it before anything moves.
+            declines: a target out of reach ends it.
         """
         if seen.status is PlantStatus.LOST:
             return Objection(StopReason.OBJECT_LOST)
@@ -126,16 +118,14 @@ class Ends:
             return Objection(StopReason.OBJECT_LOST, "dislocated off the focused axis")
         held = seen.status is PlantStatus.HELD
         if looks >= self.rule.looks and held and self.error(seen) <= self.rule.tolerance:
-            return Objection(StopReason.REACHED, self.leap)
-        reason, why = self.rule.judge(self.errors, self.limited), ""
-        if reason is StopReason.STALLED:
-            why = _hindrances(seen, last, self._controller.kinematic)
-        elif reason is StopReason.RUNNING and stopped:
-            reason = StopReason.STOPPED
-        elif reason is StopReason.RUNNING and decline and last is None and held:
-            why = out_of_reach(self._controller, seen, self.target)
-            reason = StopReason.OUT_OF_REACH if why else reason
-        return None if reason is StopReason.RUNNING else Objection(reason, why)
+            return Objection(StopReason.REACHED, self.surprise if self._leap > _LEAP else "")
+        reason = self.rule.judge(self.errors, self.limited)
+        if reason is not StopReason.RUNNING:
+            return Objection(reason)
+        if stopped:
+            return Objection(StopReason.STOPPED)
+        why = out_of_reach(self._controller, seen, self.target) if declines and held else ""
+        return Objection(StopReason.OUT_OF_REACH, why) if why else None
 
     def add(self, after: Observation, limited: bool) -> None:
         """One more movement that turns."""
@@ -144,13 +134,10 @@ class Ends:
 
     def leapt(self, off: float, note: str) -> None:
         """The object has turned by ``off`` [rad] more than predicted, and what a guard says of it."""
-        found = f"in motion {len(self.errors) - 1} {note}"
-        self.surprise = self.surprise or f"; {found}: if the object did not slide, check that sensor"
-        if off > _LEAP and not self.leap:
-            self.leap = (
-                f"{found}: if the camera was moved, or took one marker for another, the target is off by as "
-                "much"
-            )
+        if not self.surprise or off > max(self._leap, _LEAP):
+            told = "if the object did not slide, check that sensor"
+            moved = "if the camera was moved, or took one marker for another, the target is off by as much"
+            self._leap, self.surprise = off, f"in motion {len(self.errors) - 1} {note}: {told}; {moved}"
 
 
 def failed(error: BaseException, final: Observation) -> Stop:
@@ -160,25 +147,3 @@ def failed(error: BaseException, final: Observation) -> Stop:
     refused = isinstance(error, CommandRefusedError)
     reason = StopReason.COMMAND_REFUSED if refused else StopReason.PLANT_FAILED
     return Stop(reason, final, f"{type(error).__name__}: {error}", error)
-
-
-def _hindrances(seen: Observation, decision: Decision | None, model: KinematicModel) -> str:
-    """What f, linearized for the decision, sees that keeps the object from its target; empty: nothing."""
-    if decision is None or decision.linearization is None:
-        return ""
-    lin, grip, q, hand = decision.linearization, decision.grip, seen.q.numpy(), model.hand
-    found = []
-    if grip is not None and float(grip.force.max()) < FIRM * grip.wanted:
-        found.append(
-            f"turning waits for a grip of {grip.wanted:.1f} N, and no finger bears more than "
-            f"{float(grip.force.max()):.1f} N"
-        )
-    bearing = {d.what for d in lin.doubts if d.kind is ModelStatus.LINK_TOUCHES and d.value < 2 * NOISE.gap}
-    found += [f"link '{link}', which has no pad, bears on the object" for link in sorted(bearing)]
-    stands = (q <= hand.joint_lower + _AT_STOP) | (q >= hand.joint_upper - _AT_STOP)
-    stands &= (hand.joint_lower < hand.joint_upper) & model.moving(lin.contacts).numpy()
-    found += [f"joint '{hand.joint_names[j]}' stands at its stop" for j in stands.nonzero()[0]]
-    slide = [d.what for d in lin.doubts if d.kind is ModelStatus.FRICTION_LIMIT]
-    found += [f"pad '{pad}' is at its friction limit" for pad in slide]
-    found += [d.message for d in lin.doubts if d.kind is ModelStatus.SENSORS_DISAGREE]
-    return "; ".join(found)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from .._checks import check_finite, check_kind, check_positive, check_shape
-from ..exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
+from ..exceptions import NonFiniteError, ParameterError, UnknownNameError
 from ..kinematics.grasp_state import A_STATE, GraspState, check_rotation
 from ..kinematics.null_space import null_space
 from ..kinematics.se3 import exp, log
@@ -100,15 +100,13 @@ class Direction:
     """None: 0.25 deg or 0.2 mm."""
     step: float | None = None
     """Largest of a step; None: 2.5 deg or 2 mm."""
-    weight: float = 1.0
-    """Of what a step leaves unmet, relative to the other directions."""
 
     def __post_init__(self) -> None:
         if self.unit not in _SI:
             raise UnknownNameError("unit", self.unit, _SI)
         object.__setattr__(self, "axis", as_tensors(axis=self.axis)[0].double())  # the dataclass is frozen
         _unit(self.axis)
-        for name in ("tolerance", "step", "weight"):
+        for name in ("tolerance", "step"):
             if getattr(self, name) is not None:
                 check_positive(name, getattr(self, name))
 
@@ -139,37 +137,23 @@ class FocusedPose:
         tolerance_scale_i = 0.25 deg / tolerance_i,    step_scale_i = 2.5 deg / step_i
 
     Args:
-        directions: perpendicular to each other; or M_c with orthonormal rows, each a turn or a shift.
+        directions: perpendicular to each other, turns to turns and shifts to shifts.
 
     Raises:
-        ShapeError: M_c is not ``(n_x, 6)``.
-        ParameterError: a direction is not perpendicular to another, or turns and shifts.
+        ParameterError: they are not, or no Directions.
     """
 
-    def __init__(self, directions: Sequence[Direction] | Float[Tensor, "n_x 6"]) -> None:
-        given = directions
-        if isinstance(directions, torch.Tensor):
-            if directions.ndim != 2 or directions.shape[1] != 6:
-                raise ShapeError("matrix", "(n_x, 6)", directions.shape)
-            shifts = zip(directions, (directions[:, :3].abs().sum(-1) > 1e-9).tolist(), strict=True)
-            directions = [Direction(row[:3], "mm") if s else Direction(row[3:], "deg") for row, s in shifts]
+    def __init__(self, directions: Sequence[Direction]) -> None:
         listed = "a list of one to six Directions"
         if not check_kind("directions", directions, Sequence, listed):
             raise ParameterError("directions", directions, listed)
         self.directions = tuple(check_kind("directions", one, Direction, listed) for one in directions)
         matrix = self.matrix = torch.stack([one.row for one in self.directions])
-        gram = matrix @ matrix.mT - torch.eye(len(matrix), dtype=matrix.dtype)
-        square = bool((gram.abs() < 1e-9).all())
-        if not isinstance(given, torch.Tensor):
-            if not square:
-                valid = "perpendicular to each other: turns to turns, shifts to shifts"
-                raise ParameterError("directions", [str(one) for one in self.directions], valid)
-        elif not (square and torch.allclose(given.to(matrix), matrix, rtol=0, atol=1e-9)):
-            valid = "orthonormal rows (M_c M_c^T = I), each of which turns or shifts"
-            raise ParameterError("matrix", given.tolist(), valid)
+        if not bool(((matrix @ matrix.mT - torch.eye(len(matrix)).to(matrix)).abs() < 1e-9).all()):
+            valid = "perpendicular to each other: turns to turns, shifts to shifts"
+            raise ParameterError("directions", [str(one) for one in self.directions], valid)
         self.tolerance_scale = matrix.new_tensor([one.scale("tolerance") for one in self.directions])
         self.step_scale = matrix.new_tensor([one.scale("step") for one in self.directions])
-        self.weight = matrix.new_tensor([one.weight for one in self.directions])
         # translation and rotation rows are completed apart: they have different units
         self.off_matrix = torch.cat([_complement(matrix, slice(0, 3)), _complement(matrix, slice(3, 6))])
         self.off_translation = self.off_matrix[:, :3].abs().sum(-1) > 0
@@ -181,18 +165,11 @@ class FocusedPose:
         Raises:
             ParameterError: no axis.
         """
-        if isinstance(axis, Direction) or (isinstance(axis, Sequence) and isinstance(axis[0], Direction)):
-            raise ParameterError("axis", axis, "a vector; directions make a FocusedPose([...])")
         return cls([Direction(axis, "deg")])
 
     def error(self, target: PoseTarget, state: GraspState) -> float:
         """``|e| = max_i tolerance_scale_i |e_i|`` [rad], ``e = M_c`` times the twist from state to target."""
         return float((self.tolerance_scale * (self.matrix @ target.error(state))).abs().max())
-
-    @property
-    def turns(self) -> bool:
-        """One of its directions is a turn."""
-        return any(one.unit == "deg" for one in self.directions)
 
     def off_rotation(self, increment: Float[Tensor, " n_s"]) -> float:
         """Rotation off the focus in an increment [rad]."""

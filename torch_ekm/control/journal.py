@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 from collections.abc import Generator
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import torch
 
+from .._recorded import check_state
 from ..exceptions import FileFormatError, ResumeError
 from ..plant import Observation, PlantStatus
 from ..residual.files import read, write
@@ -18,6 +18,7 @@ from .closed_loop import ClosedLoop
 from .focus import PoseTarget
 from .manipulation import Manipulation, Step, Stop
 from .rehearsal import LONGEST
+from .safety.guards import deg
 
 _KIND = "turn under way"
 
@@ -89,7 +90,8 @@ class Journal:
         against = self._against(loop, known, here)
         if against:
             raise ResumeError(self.path, against)
-        loop.learned.load(known["learned"])
+        check_state(loop.learned, known["learned"])
+        loop.learned.load_state_dict(known["learned"])
         target = PoseTarget(known["target"]["position"], known["target"]["rotation"])
         return Manipulation.of(target, loop.controller.focus, self.steps(loop, target))
 
@@ -102,29 +104,23 @@ class Journal:
             return f"it is of a hand with the actuators {', '.join(known['actuators'])}"
         if here.status is PlantStatus.LOST:
             return "the object is lost: grasp it again"
-        way = (here.a - last["a"]).abs()
-        i, most = int(way.argmax()), max(LONGEST, guards.increment) + guards.encoder_jump
-        if way[i] > most:
-            return (
-                f"encoder '{hand.actuator_names[i]}' stands {math.degrees(way[i]):.1f} deg from where it was "
-                f"({math.degrees(most):.0f} deg are one motion): begin a new turn"
-            )
+        way, most = (here.a - last["a"]).abs(), max(LONGEST, guards.increment) + guards.encoder_jump
+        if float(way.max()) > most:
+            stands = f"encoder '{hand.actuator_names[int(way.argmax())]}' stands {deg(way.max())}"
+            return f"{stands} from where it was ({deg(most)} are one motion): begin a new turn"
         if here.status is PlantStatus.NOT_SEEN:
             return "" if last["seen"] else "the object was not seen, neither then nor now: clear the view"
         off = PoseTarget(last["position"], last["rotation"]).error(here.state)
         shift, turn = (float(torch.linalg.vector_norm(part)) for part in (off[:3], off[3:]))
         if last["seen"] and (shift > guards.translation_jump or turn > guards.rotation_jump):
-            return (
-                f"the object is {1e3 * shift:.0f} mm and {math.degrees(turn):.0f} deg from where it was: "
-                "begin a new turn"
-            )
+            return f"the object is {1e3 * shift:.0f} mm and {deg(turn)} from where it was: begin a new turn"
         return ""
 
     def _write(
         self, loop: ClosedLoop, target: PoseTarget, seen: Observation, motions: int, reason: str = ""
     ) -> None:
         state = {
-            "learned": loop.learned.state(),
+            "learned": dict(loop.learned.state_dict()),
             "target": {"position": target.position, "rotation": target.rotation},
             "seen": {
                 "a": seen.a, "position": seen.position, "rotation": seen.rotation,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -20,11 +19,9 @@ from ..exceptions import EKMError, FileFormatError, ParameterError, StateError
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
 from ..residual.files import known_classes, read, rebuild, write
-from ..typing import Tensor
 from .model_error import ModelError
 
 Part = Literal["servo", "forces", "figures", "error"]
-_KEPT = 8  # motions whose lessons can be taken back
 
 
 class HandKnowledge(Recorded, nn.Module):
@@ -58,7 +55,6 @@ class HandKnowledge(Recorded, nn.Module):
         self.servo, self.forces, self.figures = servo, forces, figures
         self.error = ModelError()
         """Share of a motion by which it ends elsewhere than predicted."""
-        self._before: deque[dict[str, Tensor]] = deque(maxlen=_KEPT)  # states before the last motions
 
     @classmethod
     def of(cls, hand: HandDescription, *, learns: bool = True, adapts: bool = True) -> HandKnowledge:
@@ -89,30 +85,14 @@ class HandKnowledge(Recorded, nn.Module):
             )
         self.figures.check(hand)
 
-    def checkpoint(self) -> None:
-        """Before a motion is learned: what is known now can be had back by :meth:`take_back`."""
-        self._before.append({name: value.clone() for name, value in self.state_dict().items()})
-
-    def take_back(self, motions: int = 1) -> int:
-        """All parts are as they were before the last ``motions`` checkpoints, eight of which are kept; how
-        many that were."""
-        taken = [self._before.pop() for _ in range(min(motions, len(self._before)))]
-        if taken:
-            super().load_state_dict(taken[-1], strict=False)  # a part may have been exchanged since
-        return len(taken)
-
-    def load_state_dict(
-        self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False
-    ) -> Any:
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **options: Any) -> Any:
         """See ``torch.nn.Module``; all or nothing.
 
         Raises:
             StateMismatchError: the state is of another hand, or holds NaN. Nothing was changed.
         """
-        if strict:
-            check_state(self, state_dict)
-        self._before.clear()
-        return super().load_state_dict(state_dict, strict=strict, assign=assign)
+        check_state(self, state_dict)
+        return super().load_state_dict(state_dict, *args, **options)
 
     def reset(self, part: Part) -> None:
         """Nothing is known of this part any more.

@@ -10,15 +10,16 @@ import numpy as np
 import torch
 
 from .._noise import DEGREE
-from ..exceptions import ParameterError
 from ..kinematics.se3 import hat
 from ..typing import Float, Tensor
 from .situation import Situation
 
 if TYPE_CHECKING:
-    from ..model import Linearization
+    from .decision import Decision
 
-WEAK, FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
+_OFF_ROTATION, _OFF_TRAVEL = 1.5 * DEGREE, 2.5e-3  # [rad], [m] that a step may leave the focus
+_CREEP = 1.0  # [N] of margin that may be missing where friction and weight are equal
+_LEAST = 0.35  # of the largest step, that only a measured grip cuts further
 
 
 @dataclass(frozen=True)
@@ -63,73 +64,40 @@ def contact_travel(twist: Float[Tensor, " 6"], lever: Float[Tensor, "n_c 3"]) ->
 
 @dataclass(frozen=True)
 class StepBound:
-    """``phi = min(1, off_rotation/|w_off|, off_travel/|v_off|, (m + c)/(m - m_after)), c = creep mu f/W``.
+    """``phi = min(1, 1.5 deg/|w_off|, 2.5 mm/|v_off|, (m + c)/(m - m_after)), c = 1 N mu f/W``.
 
     phi is the share of a step that is made. w_off and v_off are the predicted rotation and translation off
     the focus; m_after the predicted friction margins. A contact that slides holds no weight W across its way:
     the heavier the object is for its grip, the less may be missing. The bound scales a step, and does not
     turn it: the same bounds as rows of the program lose objects where friction is low.
 
-    A step is not cut below ``least`` of the largest one: standing still turns nothing. But a grip f
-       is tightened first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it, where pads
-       measure it, there are none.
+    A step is not cut below 0.35 of the largest one: standing still turns nothing. But a grip f is tightened
+    first: below 0.75 of the wanted one steps become smaller, and at 0.55 of it, where pads measure it, there
+    are none.
     """
 
-    off_rotation: float = 1.5 * DEGREE
-    """[rad]"""
-    off_travel: float = 2.5e-3
-    """[m]"""
-    creep: float = 1.0
-    """Margin that may be missing where friction and weight are equal [N]."""
-    least: float = 0.35
-    """Infinite: steps are cut by a measured grip alone."""
-
-    def __post_init__(self) -> None:
-        for name in ("off_rotation", "off_travel", "creep", "least"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(name, getattr(self, name), "greater than 0")
-
-    def share(
-        self,
-        lin: Linearization,
-        delta_a: Float[Tensor, " n_a"],
-        predicted: Float[Tensor, " n_s"],
-        seen: Situation,
-        asked: float = 1.0,
-    ) -> float:
-        """phi of a step, with its grip and ``least``.
+    def share(self, decision: Decision, seen: Situation, asked: float) -> float:
+        """phi of a step.
 
         Args:
-            predicted: increment that the corrected model predicts for ``delta_a``.
-            asked: size of the step in units of the largest.
+            asked: its size in units of the largest.
         """
-        grip = grip_share(lin, seen)
-        phi = min(self._share(lin, delta_a, predicted, seen), grip)
-        phi = max(phi, min(1.0, self.least / max(asked, 1e-9)))
+        grip = 1.0 if decision.grip is None else decision.grip.bears
+        phi = max(min(self._share(decision, seen), grip), min(1.0, _LEAST / max(asked, 1e-9)))
         return phi if seen.fingertip_force is None else min(phi, grip)  # an estimate is no reason to wait
 
-    def _share(self, lin: Linearization, delta_a: Tensor, predicted: Tensor, seen: Situation) -> float:
-        off = (seen.focus.off_matrix @ predicted[-6:]).numpy()
-        translation = seen.focus.off_translation.numpy()
+    def _share(self, decision: Decision, seen: Situation) -> float:
+        lin, focus = decision.pieces[0].linearization, seen.focus
+        off = (focus.off_matrix @ decision.predicted[-6:]).numpy()
+        translation = focus.off_translation.numpy()
         rotation, travel = (math.sqrt(part @ part) for part in (off[~translation], off[translation]))
-        phi = min(1.0, self.off_rotation / max(rotation, 1e-12), self.off_travel / max(travel, 1e-12))
+        phi = min(1.0, _OFF_ROTATION / max(rotation, 1e-12), _OFF_TRAVEL / max(travel, 1e-12))
         f_n = seen.normal_force(lin)
         if f_n is None or not lin.forces.solved:
             return phi
         friction = float(lin.contacts.friction.mean()) * float(f_n.max())
-        spare = self.creep * friction / max(seen.weight, 1e-3)
-        before, after = lin.margins.numpy(), lin.margins_after(delta_a).numpy()
+        spare = _CREEP * friction / max(seen.weight, 1e-3)
+        before, after = lin.margins.numpy(), lin.margins_after(decision.delta_a).numpy()
         missing = after < -spare
-        if missing.any():
-            allowed = (before[missing] + spare) / (before[missing] - after[missing])
-            phi = min(phi, float(np.clip(allowed, 0.0, 1.0).min()))
-        return phi
-
-
-def grip_share(lin: Linearization, seen: Situation) -> float:
-    """``clip((f/f_wanted - 0.55) / 0.2, 0, 1)``: the share of a step that a grip bears."""
-    f_n = seen.normal_force(lin)
-    if f_n is None or not seen.grip:
-        return 1.0
-    held = float(f_n.max()) / seen.grip
-    return min(max((held - WEAK) / (FIRM - WEAK), 0.0), 1.0)
+        allowed = (before[missing] + spare) / (before[missing] - after[missing])
+        return min(phi, float(np.clip(allowed, 0.0, 1.0).min(initial=1.0)))

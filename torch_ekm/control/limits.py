@@ -7,7 +7,7 @@ so the program always has a solution.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -16,22 +16,20 @@ from ..exceptions import ParameterError, UnknownNameError
 from .qp import Array, Bounds, Inequality, as_array
 from .situation import LinearizedModel, Situation, grip_shares
 
+if TYPE_CHECKING:
+    from ..description import HandDescription
+
 
 @runtime_checkable
 class Limit(Protocol):
-    """What a step must not do. One of your own needs no more than this method."""
+    """What a step must not do. One of your own needs no more than this method.
+
+    One that also says what each pad in contact should bear, ``least(f_n, seen)`` ``(n_c,)`` [N], takes the
+    place of :class:`NormalForceLimit`: a grasp that does not bear it is weak.
+    """
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Inequality | Bounds | None:
         """Rows in ``u = da`` [rad]; None: nothing is near this limit."""
-        ...
-
-
-@runtime_checkable
-class KeepsForce(Protocol):
-    """A limit that says what each finger should bear: a grasp that does not is weak."""
-
-    def least(self, f_n: Array, seen: Situation) -> Array:
-        """least_i of each pad in contact ``(n_c,)`` [N]."""
         ...
 
 
@@ -48,22 +46,22 @@ class ActuatorLimit:
     fixed: tuple[str, ...] | None = None
     """Actuators that must not move; None: those that the hand's description calls posture actuators."""
 
-    def rows(self, model: LinearizedModel, seen: Situation) -> Bounds:
-        """The bounds.
+    def moves(self, hand: HandDescription) -> Array:
+        """Which actuators may move.
 
         Raises:
             UnknownNameError: no actuator of the hand has a name in ``fixed``; the message lists them.
         """
+        fixed = [one.name for one in hand.actuators if one.posture] if self.fixed is None else self.fixed
+        for name in fixed:
+            if name not in hand.actuator_names:
+                raise UnknownNameError("actuator", name, hand.actuator_names)
+        return np.array([name not in fixed for name in hand.actuator_names])
+
+    def rows(self, model: LinearizedModel, seen: Situation) -> Bounds:
         hand, a = seen.hand, as_array(seen.a)
-        lower = np.clip(hand.actuator_lower - a, -self.step, self.step)
-        upper = np.clip(hand.actuator_upper - a, -self.step, self.step)
-        names = hand.actuator_names
-        fixed = [actuator.name for actuator in hand.actuators if actuator.posture]
-        for name in fixed if self.fixed is None else self.fixed:
-            if name not in names:
-                raise UnknownNameError("actuator", name, names)
-            lower[names.index(name)] = upper[names.index(name)] = 0.0
-        return Bounds(lower, upper)
+        ends = np.stack([hand.actuator_lower, hand.actuator_upper]) - a
+        return Bounds(*np.where(self.moves(hand), np.clip(ends, -self.step, self.step), 0.0))
 
 
 @dataclass(frozen=True)
@@ -139,3 +137,7 @@ class NormalForceLimit:
         if seen.grip is None:
             return np.full(len(f_n), self.minimum)
         return np.maximum(self.minimum, self.share * grip_shares(f_n, seen.grip))
+
+
+#: What a step must not do by default: limits of actuators, normal forces and joints.
+DEFAULT_LIMITS: tuple[Limit, ...] = (ActuatorLimit(), NormalForceLimit(), JointLimit())

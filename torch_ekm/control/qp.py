@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,16 +58,13 @@ class Bounds(NamedTuple):
 Rows = Squares | Equality | Inequality | Bounds
 
 
-@dataclass(frozen=True)
-class ControlSolution:
+class ControlSolution(NamedTuple):
     """The best increment."""
 
     u: Array
     """[rad]"""
     slack: Array
     """``b - A u``: what of the equalities could not be met, in their unit."""
-    violation: float
-    """Largest violation of an inequality, in its unit."""
 
 
 @dataclass(frozen=True)
@@ -93,34 +90,16 @@ class ControlProblem:
     bounds: tuple[Array, Array]
     """lower and upper [deg]."""
 
-    @property
-    def qp(self) -> Any:
-        """The same with its slacks, a ``qpsolvers.Problem`` over ``z = [u; sl+; sl-; t]``."""
-        (A, b, rho), (C, h, rho_t), (lower, upper) = self.equality, self.inequality, self.bounds
-        n_e, n_t = len(b), len(h)
-        slacks = 2 * n_e + n_t
-        A = np.hstack([A, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
-        G = np.hstack([C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
-        return require("qpsolvers").Problem(
-            np.pad(self.P, (0, slacks)),
-            np.concatenate([self.q, rho, rho, rho_t]),
-            *((G, h) if n_t else (None, None)),
-            *((A, b) if n_e else (None, None)),
-            np.pad(lower, (0, slacks)),
-            np.pad(upper, (0, slacks), constant_values=np.inf),
-        )
-
     def solve(self) -> ControlSolution:
         """The best u: by an active set where all rows can be met, else by the open-source solver PIQP.
 
         Raises:
             SolverError: the solver did not find a solution, or is not installed.
         """
-        (A, b, _), (C, h, _) = self.equality, self.inequality
+        A, b, _ = self.equality
         u = self._without_slack()
         u = np.clip(self._by_piqp() if u is None else u, *self.bounds)
-        broken = float(np.max(C @ u - h, initial=0.0))
-        return ControlSolution(u * DEGREE, (b - A @ u) * DEGREE, broken)
+        return ControlSolution(u * DEGREE, (b - A @ u) * DEGREE)
 
     def _without_slack(self) -> Array | None:
         """u, where no multiplier is above its penalty: the slacks are then 0."""
@@ -136,9 +115,23 @@ class ControlProblem:
         return None
 
     def _by_piqp(self) -> Array:
+        """u, of the program with its slacks over ``z = [u; sl+; sl-; t]``."""
         qpsolvers = require("qpsolvers")
+        (A, b, rho), (C, h, rho_t), (lower, upper) = self.equality, self.inequality, self.bounds
+        n_e, n_t = len(b), len(h)
+        slacks = 2 * n_e + n_t
+        A = np.hstack([A, np.eye(n_e), -np.eye(n_e), np.zeros((n_e, n_t))])
+        G = np.hstack([C, np.zeros((n_t, 2 * n_e)), -np.eye(n_t)])
+        problem = qpsolvers.Problem(
+            np.pad(self.P, (0, slacks)),
+            np.concatenate([self.q, rho, rho, rho_t]),
+            *((G, h) if n_t else (None, None)),
+            *((A, b) if n_e else (None, None)),
+            np.pad(lower, (0, slacks)),
+            np.pad(upper, (0, slacks), constant_values=np.inf),
+        )
         try:
-            solution = qpsolvers.solve_problem(self.qp, solver="piqp")
+            solution = qpsolvers.solve_problem(problem, solver="piqp")
         except Exception as error:  # back ends raise types of their own
             raise SolverError("piqp", f"{type(error).__name__}: {error}") from error
         if not solution.found or solution.x is None:
@@ -165,22 +158,22 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
     for row in (row for row in rows if row is not None):
         if not isinstance(row, Rows):
             raise ParameterError("rows", type(row).__name__, "Squares, Equality, Inequality, Bounds or None")
-        _check(row, n_u)
+        if isinstance(row, Bounds):
+            lower = np.maximum(lower, _bound(row, "lower", n_u) / DEGREE)
+            upper = np.minimum(upper, _bound(row, "upper", n_u) / DEGREE)
+            continue
+        A, b, *figures = _figures(row, n_u)
         if isinstance(row, Squares):
-            unit, weight = as_array(row.unit).reshape(-1, 1), as_array(row.weight).reshape(-1, 1)
-            A, b = as_array(row.A) * DEGREE / unit, as_array(row.b) / unit[:, 0]
+            weight, unit = figures
+            A, b = A * DEGREE / unit[:, None], b / unit
             twice = 2 * A.T
-            P += twice @ (weight * A)
-            q -= twice @ (weight[:, 0] * b)
+            P += twice @ (weight[:, None] * A)
+            q -= twice @ (weight * b)
         elif isinstance(row, Equality):
-            d = as_array(row.b) / DEGREE
-            reached.append((as_array(row.A), d, np.full(len(d), as_array(row.penalty))))
-        elif isinstance(row, Inequality):
-            h = as_array(row.h) / row.unit
-            kept.append((as_array(row.C) * (DEGREE / row.unit), h, np.full(len(h), row.penalty)))
+            reached.append((A, b / DEGREE, figures[0]))
         else:
-            lower = np.maximum(lower, as_array(row.lower) / DEGREE)
-            upper = np.minimum(upper, as_array(row.upper) / DEGREE)
+            unit, penalty = figures
+            kept.append((A * (DEGREE / unit)[:, None], b / unit, penalty))
     crossed = np.flatnonzero(lower > upper)
     if crossed.size:
         i = int(crossed[0])
@@ -188,25 +181,28 @@ def build_qp(n_u: int, rows: Iterable[Rows | None]) -> ControlProblem:
     return ControlProblem(P, q, _stack(reached), _stack(kept), (lower, upper))
 
 
-def _check(row: Rows, n_u: int) -> None:
-    kind, A, b = type(row).__name__, as_array(row[0]), as_array(row[1])
-    if A.shape[-1:] not in ((), (n_u,)):
+def _figures(row: Squares | Equality | Inequality, n_u: int) -> list[Array]:
+    """The matrix as an array, and one figure of each other kind for each of its rows."""
+    kind, (A, *rest) = type(row).__name__, map(as_array, row)
+    if A.shape[1:] != (n_u,):
         raise ShapeError(f"rows of {kind}", f"(n, {n_u})", A.shape)
-    if isinstance(row, Bounds):
-        for name, value in zip(row._fields, (A, b), strict=True):
-            if value.shape not in ((), (n_u,)):
-                raise ShapeError(f"{name} of Bounds", f"({n_u},)", value.shape)
-            if np.isnan(value).any():
-                raise ParameterError(f"{name} of Bounds", value.tolist(), "numbers, or infinite")
-        return
-    if b.shape not in ((), A.shape[:-1]):
-        raise ShapeError(f"{row._fields[1]} of {kind}", f"{A.shape[:-1]}", b.shape, "one entry for each row")
-    if isinstance(row, Squares | Inequality) and not (as_array(row.unit) > 0).all():
-        raise ParameterError(f"unit of {kind}", row.unit, "greater than 0")
-    if isinstance(row, Squares) and not (as_array(row.weight) >= 0).all():
-        raise ParameterError("weight", row.weight, "at least 0: the program is convex")
-    if not all(np.isfinite(as_array(value)).all() for value in row):
+    for name, value in zip(row._fields[1:], rest, strict=True):
+        if value.shape not in ((), A.shape[:1]):
+            raise ShapeError(f"{name} of {kind}", f"{A.shape[:1]}", value.shape, "one entry for each row")
+        if (name == "unit" and not (value > 0).all()) or (name == "weight" and not (value >= 0).all()):
+            raise ParameterError(f"{name} of {kind}", value.tolist(), "positive: the program is convex")
+    if not all(np.isfinite(value).all() for value in (A, *rest)):
         raise NonFiniteError(f"{row._fields[0]}, {row._fields[1]} of {kind}")
+    return [A, *(np.broadcast_to(value, len(A)) for value in rest)]
+
+
+def _bound(row: Bounds, name: str, n_u: int) -> Array:
+    value = as_array(getattr(row, name))
+    if value.shape not in ((), (n_u,)):
+        raise ShapeError(f"{name} of Bounds", f"({n_u},)", value.shape)
+    if np.isnan(value).any():
+        raise ParameterError(f"{name} of Bounds", value.tolist(), "numbers, or infinite")
+    return value
 
 
 def as_array(x: Numbers) -> Array:

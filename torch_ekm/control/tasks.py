@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from .._checks import check_positive
 from .._noise import DEGREE
-from ..exceptions import ParameterError, ShapeError
 from .limiting import contact_travel
 from .qp import Equality, Squares, as_array
 from .situation import LinearizedModel, Situation, grip_shares
@@ -23,19 +22,14 @@ _UNMEASURED = 2.0  # [N]
 
 @runtime_checkable
 class Task(Protocol):
-    """What a step should do. One of your own needs no more than this method."""
+    """What a step should do. One of your own needs no more than this method.
+
+    One that also says how hard the finger that opposes the others is to press, ``wanted(kinematic, seen)``
+    [N], takes the place of :class:`GripForceTask`.
+    """
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares | Equality | None:
         """Rows in ``u = da`` [rad]; None: nothing is asked for here."""
-        ...
-
-
-@runtime_checkable
-class WantsGrip(Protocol):
-    """A task that says how hard the object is to be gripped."""
-
-    def wanted(self, kinematic: Linearization, seen: Situation) -> float:
-        """Normal force of the finger that opposes the others [N]."""
         ...
 
 
@@ -45,14 +39,14 @@ class FocusTask:
     near as it can (exact l1 slack). D is the ``tolerance_scale`` of the :class:`FocusedPose`."""
 
     penalty: float = 1e3
-    """rho, per degree of a focused rotation that is left unmet; times the weight of a direction."""
+    """rho, per degree of a focused rotation that is left unmet."""
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Equality:
         focus, n_q = seen.focus, model.kinematic.n_q
         M, scale = focus.matrix, focus.tolerance_scale
         left = seen.desired - M @ model.offset[n_q:]
         A = scale[:, None] * (M @ model.jacobian[n_q:])
-        return Equality(A, scale * left, self.penalty * focus.weight)
+        return Equality(A, scale * left, self.penalty)
 
 
 @dataclass(frozen=True)
@@ -134,25 +128,23 @@ class GripForceTask:
 
 @dataclass(frozen=True)
 class EffortTask:
-    """``u^T W u``: of the steps that do as well, the smallest. It makes the best step unique.
+    """``w u^T u``: of the steps that do as well, the smallest. It makes the best step unique.
 
     Raises:
-        ParameterError, ShapeError: W is not positive definite, or, as rows are asked for, not ``(n_a, n_a)``.
+        ParameterError: w is not positive.
     """
 
-    weight: float | Sequence[Sequence[float]] = 1e-2
-    """W of the E-KM paper ``(n_a, n_a)``, or the number on its diagonal, per deg^2 of an actuator."""
+    weight: float = 1e-2
+    """w, the diagonal of the paper's W; per deg^2 of an actuator."""
 
     def __post_init__(self) -> None:
-        W = np.atleast_2d(np.asarray(self.weight, float))
-        symmetric = W.shape == W.T.shape and np.isfinite(W).all() and np.allclose(W, W.T)
-        if not (symmetric and np.linalg.eigvalsh(W)[0] > 0):
-            raise ParameterError("weight", self.weight, "a positive number, or a positive definite matrix")
+        check_positive("weight", self.weight)
 
     def rows(self, model: LinearizedModel, seen: Situation) -> Squares:
-        n_a, W = len(seen.a), np.asarray(self.weight, float)
-        if W.ndim == 0:
-            return Squares(np.eye(n_a), np.zeros(n_a), W, DEGREE)
-        if len(W) != n_a:
-            raise ShapeError("weight", f"({n_a}, {n_a})", W.shape)
-        return Squares(as_array(np.linalg.cholesky(W).T), np.zeros(n_a), 1.0, DEGREE)
+        n_a = len(seen.a)
+        return Squares(np.eye(n_a), np.zeros(n_a), self.weight, DEGREE)
+
+
+#: What a step should do by default: effort, off-axis motion, grip force, focus. The figures suit the iCub
+#: hand.
+DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(), FocusTask())

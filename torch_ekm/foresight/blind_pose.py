@@ -88,7 +88,7 @@ class BlindPose(PlantWrapper):
         """``seen``, with the estimated state while the camera is off; a reading that :class:`Guards` refuse
         changes nothing of the estimate."""
         before, guards = self._before, self._tests.guards
-        believed = self._tests.motors(before, self._sent, seen) is None
+        believed = not self._tests.motors(before, self._sent, seen)
         if not self.dark:
             self._before, self._sent = seen, None
             self.dark = self._switch_off is None or self._switch_off(seen)

@@ -11,18 +11,19 @@ import torch
 from ..._noise import DEGREE, NOISE
 from ...plant import Observation, PlantStatus
 from ...typing import Array, Tensor
-from ..decision import Expectation
-from .guards import Effect, Guards, Objection, check, gravest
+from ..decision import Expectation, StopReason
+from .guards import Effect, Guards, Objection, against, deg, gravest
 
 if TYPE_CHECKING:
     from ...description import HandDescription
     from ..focus import FocusedPose
 
-_SENSORS = {
-    "encoders": "the encoders' reading", "joints": "the joints' reading", "pose": "the object's pose",
-}  # fmt: skip
+_SENSORS = "the encoders' reading", "the joints' reading", "the object's pose"
+_DRIVER = "check its driver or its time stamps"
+CHECK_PLANT = "see 'torch-ekm check --plant'"
 AGAINST = 0.3  # share of a motion that is made the other way; healthy hands make .4 of it and more
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
+_TWICE = math.sqrt(2)  # times the noise of a reading that of a difference is
 
 
 class ReadingTests:
@@ -37,35 +38,26 @@ class ReadingTests:
         self.guards, self.hand = guards, hand
         self._last: Observation | None = None
         self._still: Observation | None = None  # since which the encoders read the same, bit by bit
-        self._path = {"joints": 0.0, "pose": 0.0}  # way of the encoders since these read something else
+        self._ways = [0.0, 0.0]  # of the encoders since joints, and since the pose, read something else
 
     def at_rest(self, seen: Observation, before: Observation | None = None) -> Objection | None:
         """Of a reading without a motion since ``before``."""
-        said = [*self._ages(seen, None), *self._motors(before, None, seen)]
+        said = [*self._ages(seen, None), *self.motors(before, None, seen)]
         if before is not None:
-            back = before.time - seen.time if before.dated else 0.0
-            said += check("clock", back, 0.0, began=before.time, time=seen.time)
+            back = f"the clock went back from {before.time:.3f} to {seen.time:.3f} s: check the driver"
+            said += against(before.dated and seen.time < before.time, StopReason.STALE_SENSOR, back)
             ds = seen.state.minus(before.state).numpy()
             said += self._jumps(ds, 0 * ds, seen)
         return gravest(said)
 
-    def motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> Objection | None:
-        """Ranges, and encoders after the motors were sent by ``sent`` [rad]; None: nowhere."""
-        return gravest(self._motors(before, sent, seen))
-
     def after_motion(
-        self,
-        before: Observation,
-        sent: Tensor,
-        seen: Observation,
-        expected: Expectation | None,
-        blind: int,
+        self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation | None, blind: int
     ) -> Objection | None:
         """Of a reading after the motors were sent by ``sent`` [rad], the gravest; ``blind`` motions without a
         pose came before."""
         said = self._ages(seen, before)
         unseen = bool(said)  # the rest is still looked at
-        said += [*self._motors(before, sent, seen), *self._speed(before, seen)]
+        said += [*self.motors(before, sent, seen), *self._speed(before, seen)]
         if expected is not None:
             ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
             said += self._jumps(ds, predicted, seen, unseen)
@@ -74,35 +66,39 @@ class ReadingTests:
 
     def _ages(self, seen: Observation, before: Observation | None) -> list[Objection]:
         """Stale, repeated or missing readings; of fingertips another reading stands in."""
-        said, same, moved = [], self._same(seen), 0.0
+        said, same, moved, began = [], self._same(seen), 0.0, -math.inf
         if before is not None:
-            moved = float((seen.a - before.a).abs().max())
-            if moved == 0:
-                said += check("all repeat", all(same.values()), 0)
-                said += check(
-                    "encoders repeat", self._still is not None and self._moved(self._still, seen), 0
-                )
-            said += check("not seen", seen.status is PlantStatus.NOT_SEEN, 0)
-        for k, (sensor, what) in enumerate(_SENSORS.items()):
-            way = self._path[sensor] + moved if before is not None and same.get(sensor) else 0.0
-            found = check("repeats", way, self.guards.unchanged, {"way": way}, what=what)
-            if seen.dated:
-                taken, age = seen.taken[k], seen.time - seen.taken[k]
-                if before is not None and before.dated:
-                    late = taken <= before.time
-                    found += check("before", late, 0, what=what, taken=taken, began=before.time)
-                found += check("age", abs(age), self.guards.max_age[k], what=what, age=age)
-            if sensor == "pose" and before is not None:
-                found = [one._replace(effect=Effect.BLIND) for one in found]
-            said += found
+            moved, began = float((seen.a - before.a).abs().max()), before.time if before.dated else began
+            if moved == 0 and all(same):
+                what = "encoders, joints and pose are the same bit by bit after a motion: check the driver"
+                said.append(Objection(StopReason.STALE_SENSOR, what))
+            elif moved == 0 and self._still is not None and self._moved(self._still, seen):
+                what = "encoders are the same bit by bit while joints and object moved: check their driver"
+                said.append(Objection(StopReason.STALE_SENSOR, what))
+            if seen.status is PlantStatus.NOT_SEEN:
+                what = "the camera does not find the object: clear its view, or light it"
+                said.append(Objection(StopReason.BLIND, what, Effect.BLIND))
+        for k, what in enumerate(_SENSORS):
+            taken, most, way, why = seen.taken[k], self.guards.max_age[k], 0.0, ""
+            if before is not None and k and same[k - 1]:
+                way = self._ways[k - 1] + moved
+            if way > self.guards.unchanged:
+                why = f"{what} is the same bit by bit while the encoders moved {deg(way)}"
+            elif seen.dated and taken <= began:
+                why = f"{what} was read at {taken:.3f} s, before the motion that began at {began:.3f} s"
+            elif seen.dated and abs(seen.time - taken) > most:
+                why = f"{what} is {seen.time - taken:.3f} s old, Guards.max_age is {most:g} s"
+            effect = Effect.STOP if before is None or k < 2 else Effect.BLIND
+            said += against(why, StopReason.STALE_SENSOR, f"{why}: {_DRIVER}", effect)
         return said
 
     def _moved(self, one: Observation, other: Observation) -> bool:
         """More than noise, and not the object alone, which may have slid."""
         joint = float((other.q - one.q).abs().max())
-        return joint > math.sqrt(2) * self.guards.joint_noise and not agree(one, other, self.guards)
+        return joint > _TWICE * self.guards.joint_noise and not agree(one, other, self.guards)
 
-    def _motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> list[Objection]:
+    def motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> list[Objection]:
+        """Ranges, and encoders after the motors were sent by ``sent`` [rad]; None: nowhere."""
         hand, guards, said = self.hand, self.guards, []
         for what, names, lower, upper, value in (
             ("encoder", hand.actuator_names, hand.actuator_lower, hand.actuator_upper, seen.a),
@@ -111,50 +107,59 @@ class ReadingTests:
             read = value.detach().cpu().double().numpy()
             beyond = (lower - read).clip(min=read - upper)
             i = int(beyond.argmax())
-            angles = {"angle": read[i], "lower": lower[i], "upper": upper[i], "most": guards.beyond}
-            said += check("range", beyond[i], guards.beyond, angles, what=what, name=names[i])
+            out = f"{what} '{names[i]}' reads {deg(read[i])}, its range is {deg(lower[i])} to {deg(upper[i])}"
+            out += f" (Guards.beyond is {deg(guards.beyond)}): check it"
+            said += against(beyond[i] > guards.beyond, StopReason.OUT_OF_RANGE, out)
         if before is None:
             return said
         moved, v = (seen.a - before.a).numpy(), np.zeros(len(seen.a)) if sent is None else sent.numpy()
         most = guards.unchanged if sent is None else guards.encoder_jump
         away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))  # further than sent, or back
         i = int(away.argmax())
-        angles = {"went": moved[i], "sent": v[i], "most": most}
-        said += check("encoder jump", away[i], most, angles, name=hand.actuator_names[i])
+        jump = f"encoder '{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
+        jump += f"({deg(most)} more are allowed, Guards.encoder_jump): check its cable and zero"
+        said += against(away[i] > most, StopReason.ENCODER_JUMP, jump)
         if abs(v).max() >= guards.unchanged:
             share, i = float(moved @ v) / float(v @ v), int((moved * v).argmin())
-            angles, name = {"went": moved[i], "sent": v[i]}, hand.actuator_names[i]
-            said += check("encoders against", -share, AGAINST, angles, share=share, name=name)
+            back = f"encoders made {share:.1f} of the motion that was commanded (limit -{AGAINST:g}): "
+            back += f"'{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were"
+            back += f": a sign of the motors or of their encoders is wrong; {CHECK_PLANT}"
+            said += against(-share > AGAINST, StopReason.WRONG_WAY, back)
         return said
 
     def _speed(self, before: Observation, seen: Observation) -> list[Objection]:
         if not (seen.dated and before.dated):
             return []
         moved, most = (seen.a - before.a).numpy(), self.guards.speed
-        seconds, i = seen.taken.encoders - before.taken.encoders, int(abs(moved).argmax())
-        angles, name = {"went": moved[i], "most": most}, self.hand.actuator_names[i]
-        return check("speed", abs(moved[i]), most * max(seconds, 0.0), angles, name=name, seconds=seconds)
+        seconds, i = max(seen.taken.encoders - before.taken.encoders, 0.0), int(abs(moved).argmax())
+        fast = f"encoder '{self.hand.actuator_names[i]}' went {deg(moved[i])} in {seconds:.3g} s "
+        fast += f"(Guards.speed is {deg(most)}/s): the driver must wait for the end of a motion, and date it"
+        return against(abs(moved[i]) > most * seconds, StopReason.SPEED_CEILING, fast)
 
     def _jumps(self, ds: Array, predicted: Array, seen: Observation, unseen: bool = False) -> list[Objection]:
         """What no motion does; of a pose that is not seen: nothing."""
         guards, off, n_q = self.guards, ds - predicted, self.hand.n_q
         i = int(abs(off[:n_q]).argmax())
-        angles = {"turned": ds[i], "predicted": predicted[i], "most": guards.joint_jump}
-        said = check("joint jump", abs(off[i]), guards.joint_jump, angles, name=self.hand.joint_names[i])
-        if not unseen and hold(seen):
+        jump = f"joint '{self.hand.joint_names[i]}' turned {deg(ds[i])} where {deg(predicted[i])} were "
+        jump += f"predicted (Guards.joint_jump is {deg(guards.joint_jump)}): check its sensor"
+        said = against(abs(off[i]) > guards.joint_jump, StopReason.JOINT_JUMP, jump)
+        held = seen.fingertip_force is not None and int((seen.fingertip_force > NOISE.pressing).sum()) > 1
+        if not unseen and held:
             way, turn = (math.sqrt(part @ part) for part in (off[-6:-3], off[-3:]))
-            share = max(way / guards.translation_jump, turn / guards.rotation_jump)
-            angles, most = {"turn": turn, "most": guards.rotation_jump}, 1e3 * guards.translation_jump
-            said += check("pose jump", share, 1.0, angles, way=1e3 * way, most_way=most)
+            jump = f"the pose is {1e3 * way:.1f} mm and {deg(turn)} away from what was predicted, while the "
+            jump += f"fingertips hold the object (Guards allow jumps of {1e3 * guards.translation_jump:g} mm "
+            jump += f"and {deg(guards.rotation_jump)}): check camera and markers"
+            far = way > guards.translation_jump or turn > guards.rotation_jump
+            said += against(far, StopReason.POSE_JUMP, jump)
         return said
 
     def _gate(
         self, before: Observation, ds: Array, expected: Expectation, seen: Observation, blind: int
     ) -> list[Objection]:
         """The innovation against its covariance, see :class:`~torch_ekm.control.Guards`."""
-        guards, n_q, predicted = self.guards, self.hand.n_q, expected.increment.numpy()
+        n_q, predicted = self.hand.n_q, expected.increment.numpy()
         # blind motions before this one left the pose as unsure as the model is
-        share = guards.relative * (1 + blind)
+        share = NOISE.described * (1 + blind)
         way, turn = (math.sqrt(part @ part) for part in (predicted[-6:-3], predicted[-3:]))
         along, about = way + _LEVER * turn, turn + way / _LEVER
         size = np.array([abs(predicted[:n_q]).max()] * n_q + [along] * 3 + [about] * 3)
@@ -164,12 +169,14 @@ class ReadingTests:
         names = [f"joint '{name}' turned" for name in self.hand.joint_names]
         names += [f"the object {went} {axis}" for went in ("went along", "turned about") for axis in "xyz"]
         unit, scale = ("mm", 1e-3) if n_q <= i < n_q + 3 else ("deg", DEGREE)
-        words = {"came": ds[i] / scale, "predicted": predicted[i] / scale, "sigma": sigma[i] / scale}
-        return check("gate", z[i], guards.gate, what=names[i], unit=unit, **words)
+        came, guess, std = ds[i] / scale, predicted[i] / scale, sigma[i] / scale
+        odd = f"{names[i]} {came:.2f} {unit} where {guess:.2f} ± {std:.2f} {unit} were predicted "
+        odd += f"(Guards.gate is {self.guards.gate:g})"
+        return against(z[i] > self.guards.gate, StopReason.BLIND, odd, Effect.UNLEARNED)
 
     def _noise(self, before: Observation, seen: Observation) -> Array:
         """Variances of a measured increment ``(n_s,)``; of poses as stated, and no less than the guards'."""
-        least = np.array([self.guards.translation_noise**2] * 3 + [self.guards.rotation_noise**2] * 3)
+        least = np.array(_pose_std(self.guards)) ** 2
         pose = 0 * least
         for cov in (_stated(before), _stated(seen)):
             pose += least if cov is None else np.maximum(np.nan_to_num(cov.diagonal().numpy()), least)
@@ -186,38 +193,37 @@ class ReadingTests:
         """Standard deviation of a pose in the focus, as a turn [rad]: as stated, or the guards'."""
         cov = _stated(seen)
         if cov is None or not bool(torch.isfinite(cov).all()):
-            std = [self.guards.translation_noise] * 3 + [self.guards.rotation_noise] * 3
-            cov = torch.diag(torch.tensor(std).double().square())
+            cov = torch.diag(torch.tensor(_pose_std(self.guards)).double().square())
         M = focus.matrix
         return float((focus.tolerance_scale * (M @ cov @ M.mT).diagonal().clamp(min=0.0).sqrt()).max())
 
     def follow(self, before: Observation | None, seen: Observation) -> None:
         """Remember a reading, and how far the encoders went since joints and pose changed."""
         same, moved = self._same(seen), 0.0 if before is None else float((seen.a - before.a).abs().max())
-        self._path = {sensor: way + moved if same[sensor] else 0.0 for sensor, way in self._path.items()}
+        self._ways = [way + moved if one else 0.0 for way, one in zip(self._ways, same, strict=True)]
         if self._still is None or not torch.equal(seen.a, self._still.a):
             self._still = seen
         self._last = seen
 
-    def _same(self, seen: Observation) -> dict[str, bool]:
-        """Sensors that read what they read before, bit by bit."""
+    def _same(self, seen: Observation) -> tuple[bool, bool]:
+        """Joints, and the pose, read what they read before, bit by bit."""
         last = self._last
         if last is None:
-            return {"joints": False, "pose": False}
+            return False, False
         stands = torch.equal(seen.position, last.position) and torch.equal(seen.rotation, last.rotation)
-        return {"joints": torch.equal(seen.q, last.q), "pose": stands}
-
-
-def hold(seen: Observation) -> bool:
-    """Two fingertips at least measure a force: an object is between them."""
-    return seen.fingertip_force is not None and int((seen.fingertip_force > NOISE.pressing).sum()) > 1
+        return torch.equal(seen.q, last.q), stands
 
 
 def agree(one: Observation, other: Observation, guards: Guards) -> bool:
     """Two readings of a hand at rest show the same."""
     ds = other.state.minus(one.state)
-    noise = [guards.joint_noise] * len(one.q) + [guards.translation_noise] * 3 + [guards.rotation_noise] * 3
-    return bool((ds.abs() <= math.sqrt(2) * guards.gate * ds.new_tensor(noise)).all())
+    noise = ds.new_tensor([guards.joint_noise] * len(one.q) + _pose_std(guards))
+    return bool((ds.abs() <= _TWICE * guards.gate * noise).all())
+
+
+def _pose_std(guards: Guards) -> list[float]:
+    """Of a pose, where nothing better is stated [m, rad]."""
+    return [guards.translation_noise] * 3 + [NOISE.rotation] * 3
 
 
 def _stated(seen: Observation) -> Tensor | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -14,7 +13,8 @@ from ...plant import Observation, PlantStatus
 from ...typing import Tensor
 from ..decision import Decision, Expectation, StopReason
 from ..lessons import felt
-from .guards import TABLE, Effect, Guards, Objection, check, deg, ended, gravest
+from .fingertips import FingertipTests
+from .guards import Effect, Guards, Objection, against, deg, gravest
 from .motions import MotionTests
 from .readings import ReadingTests, agree
 
@@ -22,8 +22,11 @@ if TYPE_CHECKING:
     from ...model import KinematicModel
     from ..knowledge import HandKnowledge
 
+_LOOKS = 2  # further readings of a sensor that is in doubt
 _STILL = 0.05 * DEGREE  # an encoder that moves less stands
 _UNDATED = "readings have no date, so their age is not checked: give Observation.time, or stamps"
+
+Look = Callable[[], Observation]
 
 
 class Verdict(NamedTuple):
@@ -39,8 +42,6 @@ class Verdict(NamedTuple):
     """What a guard objects to where the loop goes on."""
     expected: Expectation | None = None
     """What f + g predict of what the encoders did; None: the model has no step."""
-    encoders: bool = True
-    """The servos may be learned from them."""
 
 
 class Watch:
@@ -49,41 +50,33 @@ class Watch:
     Args:
         guards: limits.
         model: f, with the hand.
-        tolerance: of the target [rad]; errors that grow by more are no noise.
         knowledge: of the hand.
     """
 
-    def __init__(
-        self,
-        guards: Guards,
-        model: KinematicModel,
-        tolerance: float,
-        knowledge: HandKnowledge,
-    ) -> None:
+    blind = 0
+    """Motions in succession without a pose."""
+    gated = 0
+    """Motions in succession that nothing but the gate objects to."""
+    slid = ""
+    """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
+    lie = ""
+    """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
+    doubt = ""
+    """A fingertip at fault, or on a hand of which nothing is known all of them; or empty."""
+
+    def __init__(self, guards: Guards, model: KinematicModel, knowledge: HandKnowledge) -> None:
         self.guards, self.hand = guards, model.hand
         self.readings = ReadingTests(guards, model.hand)
-        self.motions = MotionTests(self.readings, model, knowledge)
-        self.blind = 0
-        """Motions in succession without a pose."""
-        self.gated = 0
-        """Motions in succession that nothing but the gate objects to."""
-        self.slid = ""
-        """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
-        self.lie = ""
-        """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
-        self.doubt = ""
-        """That fingertips and springs contradict each other on a hand of which nothing is known; or empty."""
-        self._objected: Counter[str] = Counter()
-        """Motions in succession in which a test of the table objects."""
+        self.motions = MotionTests(self.readings, model)
+        self.fingertips = FingertipTests(guards, model, knowledge.forces.usual)
+        self._running: dict[tuple[StopReason, int], int] = {}  # motions in succession in which it is raised
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
-        self._tolerance, self._away = tolerance, 0
         self._undated = ""
-        """That readings have no date, until it is said."""
 
-    def first(self, seen: Observation, look: Callable[[], Observation]) -> Verdict:
+    def first(self, seen: Observation, look: Look) -> Verdict:
         """The reading before the first motion; further ones from ``look`` where it is in doubt."""
         doubt = None
-        for left in range(self.guards.looks, -1, -1):
+        for left in range(_LOOKS, -1, -1):
             doubt = None if seen.status is PlantStatus.LOST else self.readings.at_rest(seen)
             if left == 0 or (doubt is None and seen.status is not PlantStatus.NOT_SEEN):
                 break
@@ -94,11 +87,6 @@ class Watch:
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return Verdict(seen, doubt is None, doubt)
 
-    def command(self, decision: Decision, seen: Observation, first: bool) -> Objection | None:
-        """Why a motion, or the first that turns, is refused before it is made; None: it is not. Its size is
-        the gate's concern."""
-        return gravest(self.motions.before(decision, seen, first))
-
     def motion(
         self,
         before: Observation,
@@ -106,7 +94,7 @@ class Watch:
         sent: Tensor,
         after: Observation,
         expect: Callable[[Tensor], Expectation],
-        look: Callable[[], Observation],
+        look: Look,
     ) -> Verdict:
         """Judge a movement of the motors by ``sent`` [rad].
 
@@ -124,15 +112,18 @@ class Watch:
             if not self.slid:
                 return Verdict(seen, False, doubt, "", expected)
             doubt = Objection(doubt.reason, self.slid, Effect.UNLEARNED)
-        force, said = self.motions.fingertips(before, decision, seen)
+        force, said = self.fingertips.after(before, decision, seen)
         self.readings.follow(before, seen)
         if force is not seen.fingertip_force:
             seen = dataclasses.replace(seen, fingertip_force=force)
         if doubt is not None and (doubt.effect is Effect.BLIND or not sure):
-            return self._blind(before, seen, doubt, expected, said)
+            return self._verdict(*self._blind(before, seen, doubt, expected), doubt, expected, said)
         if not self.slid:
-            said += self._running(self.motions.motion(before, sent, seen, expected))
-        return self._seen(seen, doubt, expected, said)
+            said += self._in_succession(self.motions.after(before, sent, seen, expected))
+        measured, self.blind, self.gated = self.blind == 0, 0, 0 if doubt is None else self.gated + 1
+        # what is seen again and again is the truth, and the model is wrong
+        true = doubt is None or (self.gated > self.guards.blind_motions and not self.slid)
+        return self._verdict(seen, true and measured, doubt, expected, said)
 
     def _look(
         self,
@@ -141,99 +132,73 @@ class Watch:
         sent: Tensor,
         seen: Observation,
         expect: Callable[[Tensor], Expectation],
-        look: Callable[[], Observation],
+        look: Look,
     ) -> tuple[Observation, Observation | None, Objection | None, Expectation | None]:
         """The reading to be judged, the look before it, what speaks against it, and what was expected."""
         last, expected = None, None
-        for left in range(self.guards.looks, -1, -1):
+        for left in range(_LOOKS, -1, -1):
             if seen.status is PlantStatus.LOST:
                 break
             if decision.pieces and (last is None or not torch.equal(seen.a, last.a)):
                 expected = expect(seen.a - before.a)
             doubt = self.readings.after_motion(before, sent, seen, expected, self.blind)
-            if left == 0 or (doubt is None and not self.motions.high(seen)):
+            if left == 0 or (doubt is None and not self.fingertips.high(seen)):
                 return seen, last, doubt, expected
             last, seen = seen, _with_events(look(), seen)
         return seen, last, None, expected
 
-    def _running(self, said: list[Objection]) -> list[Objection]:
+    def _in_succession(self, said: list[Objection]) -> list[Objection]:
         """With the end of the manipulation, where a test objects in as many motions running as it may."""
-        for name, test in TABLE.items():
-            found = next((one for one in said if one.test == name), None)
-            n = self._objected[name] = 0 if found is None else self._objected[name] + 1
-            if found is not None and 0 < test.running <= n:
-                said.append(Objection(found.reason, f"{found.message} (motions running: {n})"))
-        return said
+        raised = {(one.reason, one.running): one for one in said if one.running}
+        self._running = {key: self._running.get(key, 0) + 1 for key in raised}
+        told = {key: f"{one.message} (motions running: {self._running[key]})" for key, one in raised.items()}
+        return said + [Objection(key[0], told[key]) for key, n in self._running.items() if n >= key[1]]
 
     def _blind(
-        self,
-        before: Observation,
-        seen: Observation,
-        doubt: Objection,
-        expected: Expectation | None,
-        said: list[Objection],
-    ) -> Verdict:
-        """The pose that the model predicts for what the encoders did, for some motions."""
-        pose, most = before.state, self.guards.blind_motions
-        if expected is not None:
-            pose = pose.plus(expected.increment)
-        status = PlantStatus.NOT_SEEN
-        seen = dataclasses.replace(seen, position=pose.position, rotation=pose.rotation, status=status)
+        self, before: Observation, seen: Observation, doubt: Objection, expected: Expectation | None
+    ) -> tuple[Observation, bool]:
+        """With the pose that the model predicts for what the encoders did, which teaches nothing."""
+        pose = before.state if expected is None else before.state.plus(expected.increment)
         self.blind += 1
-        halt = ended(said)
-        if halt is None and self.blind > most:
-            more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
-            halt = Objection(doubt.reason, more)
-        return Verdict(seen, False, halt, doubt.message, expected)
+        status = PlantStatus.NOT_SEEN
+        return dataclasses.replace(seen, position=pose.position, rotation=pose.rotation, status=status), False
 
-    def _seen(
+    def _verdict(
         self,
         seen: Observation,
+        teaches: bool,
         doubt: Objection | None,
         expected: Expectation | None,
         said: list[Objection],
     ) -> Verdict:
-        """Of a reading with its pose."""
-        measured, halt = self.blind == 0, ended(said)
-        self.blind, self.gated = 0, 0 if doubt is None else self.gated + 1
-        # what is seen again and again is the truth, and the model is wrong
-        true = doubt is None or (self.gated > self.guards.blind_motions and not self.slid)
-        teaches = true and measured and all(one.effect is Effect.TOLD for one in said)
-        lies = (one.message for one in said if one.effect is Effect.LIES)
-        self.lie = "; ".join(lies) or self.lie
-        self.doubt = next((one.message for one in said if one.test == "first scale"), self.doubt)
-        notes = [self._undated, "" if doubt is None else doubt.message]
-        notes += [one.message for one in said if one.effect is not Effect.STOP]
+        most = self.guards.blind_motions
+        if doubt is not None and self.blind > most:
+            more = f"{doubt.message} ({self.blind} motions running, Guards.blind_motions is {most})"
+            said = [*said, Objection(doubt.reason, more)]
+        goes_on = [one for one in said if one.effect is not Effect.STOP]
+        lies = "; ".join(one.message for one in goes_on if one.effect is Effect.LIES)
+        told = [one.message for one in goes_on if one.reason is StopReason.FINGERTIP_FAULT]
+        self.lie, self.doubt = lies or self.lie, next(iter(told), self.doubt)
+        notes = [self._undated, "" if doubt is None else doubt.message, *(one.message for one in goes_on)]
         self._undated = ""
-        encoders = all(one.reason is not StopReason.ENCODER_DRIFT for one in said)
-        return Verdict(seen, teaches, halt, "; ".join(filter(None, notes)), expected, encoders)
+        teaches = teaches and all(one.effect is Effect.TOLD for one in said)
+        halt = next((one for one in said if one.effect is Effect.STOP), None)
+        return Verdict(seen, teaches, halt, "; ".join(filter(None, notes)), expected)
 
     def _slid(
         self, reason: StopReason, before: Observation, expected: Expectation | None, seen: Observation
     ) -> str:
         """What two looks show that agree is true of a pose where the grip has changed, too, and of a joint
         where the pads that press lie on the object; empty: it is not."""
-        true = False
-        if expected is not None and reason is StopReason.JOINT_JUMP:
-            true = self.motions.on_surface(seen)
-        elif expected is not None and reason is StopReason.POSE_JUMP:
-            surprise = felt(self.hand, expected, before, seen)
-            true = surprise is not None and surprise.wrong(before)
-        if expected is None or not true:
+        if expected is None:
+            return ""
+        surprise = felt(self.hand, expected, before, seen) if reason is StopReason.POSE_JUMP else None
+        changed = surprise is not None and surprise.wrong(before)
+        if not (changed or (reason is StopReason.JOINT_JUMP and self.motions.on_surface(seen))):
             return ""
         ds = (seen.state.minus(before.state) - expected.increment)[-6:]
         way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
         return f"the object has slid {1e3 * way:.1f} mm and {deg(turn)} farther than predicted"
-
-    def way(self, errors: list[float], decision: Decision, moved: Tensor) -> Objection | None:
-        """The object goes away from its target, again and again, while the motors obey. Where it has come
-        half the way, no sign is wrong: the grasp turns no further, and the stopping rule says so."""
-        da = decision.delta_a
-        if min(errors) < 0.5 * errors[0]:  # a way that led there
-            return None
-        away = errors[-1] - errors[-2] > self._tolerance and float(moved @ da) > 0.5 * float(da @ da)
-        self._away = self._away + 1 if away else 0
-        return gravest(check("away", self._away, self.guards.wrong_way - 1))
 
     def rest(self, before: Observation, seen: Observation) -> Observation:
         """A further reading of a hand at rest, or ``before`` where it cannot be one."""
@@ -254,7 +219,8 @@ class Watch:
         self._still = (self._still + 1) * (still & (size > self.guards.stuck_command))
         which = (self._still > 1) | (stuck & still & (size > NOISE.dead_zone))
         names = ", ".join(f"'{self.hand.actuator_names[i]}'" for i in which.nonzero().flatten().tolist())
-        return gravest(check("stuck", len(names), 0, names=names))
+        told = f"actuator {names} does not move however it is commanded: check motor and tendon"
+        return gravest(against(names, StopReason.ACTUATOR_STUCK, told))
 
 
 def _with_events(seen: Observation, earlier: Observation) -> Observation:
