@@ -250,7 +250,8 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
     assert not bool(recorded.first.any()), "it does not hold first"
     assert recorded.stood is not None
     begins = result.steps[0].before if result.steps else result.stop.final
-    assert float((begins.a - recorded.stood.a).abs().max()) < _STANDS, "it goes on from elsewhere"
+    away = float((begins.a - recorded.stood.a).abs().max())
+    assert away < _STANDS, f"it goes on from elsewhere, {away:.3f} rad away"
     return written["motions"], result.reason.value
 
 

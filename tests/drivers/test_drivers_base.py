@@ -185,6 +185,15 @@ def test_holding_takes_the_middle_of_three_readings(driver) -> None:
     assert driver.written[-1][0] == pytest.approx([1600.0, 2400.0])
 
 
+def test_a_hand_that_holds_is_read_once_it_has_yielded(driver) -> None:
+    """A servo under load stands short of its goal: where its goal becomes where it stands, it yields again."""
+    send, driver.motors.speed = driver.motors.send, 100.0
+    driver.motors.send = lambda goal: send([at - 6.0 for at in goal])
+    held = driver.command(radians(0.0, 0.0))
+    torch.testing.assert_close(held.a, radians(0.99, 1.01), atol=1e-6, rtol=0)
+    torch.testing.assert_close(driver.observe().a, held.a)
+
+
 def test_a_dry_run_prints_and_sends_nothing(tmp_path) -> None:
     said: list[str] = []
     driver = FakeDriver(write(tmp_path), dry_run=True, say=said.append)

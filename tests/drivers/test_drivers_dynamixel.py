@@ -123,6 +123,20 @@ def test_a_packet_that_is_lost_is_asked_for_again(bus, tmp_path) -> None:
         assert not lost
 
 
+def test_an_answer_that_comes_late_is_passed_over(bus, tmp_path) -> None:
+    """That of servo 2 to an earlier question, before that of servo 1."""
+    with open_at(bus, tmp_path) as plant:
+        late: list[bytes] = []
+        bus.spoil = lambda packet: late.append(_as(packet, 2)) or packet
+        at = plant.observe().a
+        bus.spoil = lambda packet: late.pop(0) + packet if late else packet
+        assert late
+        asked, again = [], plant._port._again
+        plant._port._again = lambda ask: asked.append(0) or again(ask)
+        torch.testing.assert_close(plant.observe().a, at)
+        assert len(asked) == 1, "and nothing is asked again"
+
+
 def test_a_servo_that_has_switched_off_says_why(bus, tmp_path) -> None:
     with open_at(bus, tmp_path) as plant:
         bus.tables[2][70] = 0b100100

@@ -16,11 +16,13 @@ from torch_ekm.interop import read_bag
 
 typesys = pytest.importorskip("rosbags.typesys", reason="extra 'interop'")
 from rosbags import rosbag1, rosbag2  # noqa: E402
+from rosbags.convert.converter import LATCH  # noqa: E402
 
 TYPES = {
     kind: typesys.get_typestore(getattr(typesys.Stores, "ROS1_NOETIC" if kind == "ros1" else "LATEST"))
     for kind in ("ros1", "ros2")
 }
+LATCHED: tuple[dict[str, Any], dict[str, Any]] = ({"offered_qos_profiles": LATCH}, {"latching": 1})
 Heard = tuple[float, str, Any]  # logged [s], topic, message without header or (type, its fields)
 
 
@@ -46,7 +48,8 @@ class Maker:
         layout = self.make("std_msgs/msg/MultiArrayLayout", [], 0)
         return self.make("std_msgs/msg/Float64MultiArray", layout, np.array(values, dtype=float))
 
-    def write(self, folder: Path, heard: Iterable[Heard]) -> Path:
+    def write(self, folder: Path, heard: Iterable[Heard], latched: str = "") -> Path:
+        """With the durability of transient local, or ROS 1's latching, for one topic."""
         path = folder / ("own.bag" if self.kind == "ros1" else "own")
         if self.kind == "ros1":
             writer: Any = rosbag1.Writer(path)
@@ -58,7 +61,9 @@ class Maker:
         with writer:
             for logged, topic, message in heard:
                 kind = message.__msgtype__
-                topics[topic] = topics.get(topic) or writer.add_connection(topic, kind, typestore=self.types)
+                if topic not in topics:
+                    named = LATCHED[self.kind == "ros1"] if topic == latched else {}
+                    topics[topic] = writer.add_connection(topic, kind, typestore=self.types, **named)
                 writer.write(topics[topic], round(1e9 * logged), pack(message, kind))
         return path
 
@@ -136,6 +141,18 @@ def test_nothing_is_held_for_ever(ros, tmp_path) -> None:
     steps = own.y[:, 0].tolist()
     assert max(steps) == 1.0, "no motion goes over the pause"
     assert "because /pauses.data[0] is silent or not finite in 16 rows, first at 0.88 s" in own.notes
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_what_is_latched_holds_until_it_is_said_anew(kind: str, tmp_path) -> None:
+    """Three settings within 0.02 s, and nothing for 2 s."""
+    ros = Maker(kind)
+    heard = [(0.5 + 0.01 * k, "/mode", ros.array(k)) for k in range(3)]
+    heard += [(1 + 0.02 * k, "/u", ros.array(k)) for k in range(100)]
+    assert (column(read_bag(ros.write(tmp_path, heard, latched="/mode"), "/u"), "/mode.data[0]") == 2.0).all()
+    (tmp_path / "volatile").mkdir()
+    table = read_bag(ros.write(tmp_path / "volatile", heard), "/u")
+    assert np.isnan(column(table, "/mode.data[0]")).all()
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])

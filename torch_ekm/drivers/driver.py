@@ -233,6 +233,7 @@ class HandDriver(ABC):
                 raise
         else:
             self.hold()
+            self._rest(time.monotonic())  # a motor under load yields where its goal becomes where it stands
         self._last = self._newer(reading=self._last)
         return self._observation(self._last)
 
