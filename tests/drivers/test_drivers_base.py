@@ -186,7 +186,7 @@ def test_holding_takes_the_middle_of_three_readings(driver) -> None:
 
 
 def test_a_hand_that_holds_is_read_once_it_has_yielded(driver) -> None:
-    """A servo under load stands short of its goal: where its goal becomes where it stands, it yields again."""
+    """A servo under load stands short of its goal: as its goal becomes where it stands, it yields."""
     send, driver.motors.speed = driver.motors.send, 100.0
     driver.motors.send = lambda goal: send([at - 6.0 for at in goal])
     held = driver.command(radians(0.0, 0.0))

@@ -300,6 +300,18 @@ def test_in_mode_3_a_range_beyond_the_servos_limits_is_refused(tmp_path) -> None
             after = plant.command(radians(0.34, 0.0))  # to the end of the range
             torch.testing.assert_close(after.a[0], radians(87 * DEG)[0], atol=TICK, rtol=0)
         open_at(bus, tmp_path, mode="baud =|mode = 4\nbaud =").close()
+        bus.set(1, "max_position", 100)
+        with pytest.raises(DescriptionError, match=r"0 and 100: write mode = 4, or correct 'zero'"):
+            open_at(bus, tmp_path, mode=mode)
+
+
+def test_a_servo_that_obeys_another_ones_commands_is_refused(tmp_path) -> None:
+    with servos() as bus:
+        bus.set(2, "secondary", 1)
+        with pytest.raises(DescriptionError, match=r"toml:11: .*'right': its Secondary ID is 1"):
+            open_at(bus, tmp_path)
+        bus.set(2, "secondary", 2)
+        open_at(bus, tmp_path).close()
 
 
 @pytest.mark.parametrize("name", ["pwm", "pwm_limit", "current", "current_limit"])

@@ -258,13 +258,16 @@ def test_rows_are_in_the_order_of_time_whoever_wrote_them(ros, tmp_path) -> None
     assert not table.run.any()
 
 
-def test_a_time_in_a_csv_that_goes_back_begins_a_run(tmp_path) -> None:
+@pytest.mark.parametrize(
+    "name", ["time [s]", "%time", "__time", "/joint_states/header.stamp", "timestamp_ns"]
+)
+def test_a_time_in_a_csv_that_goes_back_begins_a_run(name, tmp_path) -> None:
     rows = [f"{0.1 * k:.3f},{1000 * run + k},1" for run in (0, 1) for k in range(50)]
     path = tmp_path / "own.csv"
-    path.write_text("\n".join(["time [s],q,u", *rows]))
+    path.write_text("\n".join([f"{name},q,u", *rows]))
     own = load_own(path, Columns(["q"], ["u"], ["q"]))
     assert own.y[:, 0].tolist() == [1.0] * 98
-    assert own.notes == " 2 runs: column 'time [s]' goes back."
-    path.write_text("\n".join(["time,q,u", *rows[::-1]]))
+    assert own.notes == f" 2 runs: column '{name}' goes back."
+    path.write_text("\n".join([f"{name},q,u", *rows[::-1]]))
     own = load_own(path, Columns(["q"], ["u"], ["q"]))
-    assert "'time' goes back in 98 of 100 rows, first in row 2" in own.notes
+    assert f"'{name}' goes back in 98 of 100 rows, first in row 2" in own.notes

@@ -24,7 +24,9 @@ _READERS = {
 }  # fmt: skip
 _MOST_COLUMNS = 4096
 _INDEXED = re.compile(r"(.+)\[([0-9]{1,4})\]")
-_TIME = re.compile(r"(time|timestamp|stamp)([ _]?[\[(]?(s|ms|us|ns|sec|seconds)[\])]?)?", re.IGNORECASE)
+_TIME = re.compile(  # also %time of ROS 1, __time of PlotJuggler, header.stamp
+    r"(.*[./])?[%_]*(time|timestamp|stamp)([ _]?[\[(]?(s|ms|us|ns|sec|seconds)[\])]?)?", re.IGNORECASE
+)
 
 
 class Rows(NamedTuple):
