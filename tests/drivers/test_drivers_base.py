@@ -19,6 +19,7 @@ from torch_ekm.exceptions import (
     NeverAtRestError,
     NonFiniteError,
     ObjectLostError,
+    ParameterError,
     ShapeError,
     StaleReadingError,
 )
@@ -74,6 +75,11 @@ def test_a_command_beyond_the_limits_is_refused_and_nothing_is_sent(driver) -> N
         driver.command(radians(0.0, math.nan))
     with pytest.raises(ShapeError, match="left, right"):
         driver.command(radians(0.1))
+    for wrong in (None, "open", radians(0.1, 0.1).to(torch.complex128), radians(0.1, 0.1).to_sparse()):
+        with pytest.raises(ParameterError, match="delta_a"):
+            driver.command(wrong)
+    with pytest.raises(ParameterError, match="path"):
+        driver.follow(None, lambda seen: True)
     with pytest.raises(CommandRefusedError, match=r"motor 'right': a command of 30 deg.*increment.* 20 deg"):
         driver.command(radians(0.0, 30 * DEG))
     driver.motors = driver.motors.__class__([1000 + 600 * 220 * DEG, 2400.0], 1.0)

@@ -271,3 +271,10 @@ def test_a_time_in_a_csv_that_goes_back_begins_a_run(name, tmp_path) -> None:
     path.write_text("\n".join([f"{name},q,u", *rows[::-1]]))
     own = load_own(path, Columns(["q"], ["u"], ["q"]))
     assert f"'{name}' goes back in 98 of 100 rows, first in row 2" in own.notes
+
+
+@pytest.mark.parametrize("end", ["", ".csv", ".mcap", ".db3"])
+def test_a_name_that_no_file_can_have_is_no_file(end: str) -> None:
+    for name in ("n" * 300 + end, "n\0n" + end):
+        with pytest.raises(DescriptionError):
+            load_own(name, Columns(["q"], ["u"], ["q"]), clock="/u")

@@ -129,6 +129,7 @@ class ClosedLoop:
 
         Nothing moves, and nothing is learned.
         """
+        check_kind("target", target, PoseTarget)
         planner = self.planner if isinstance(self.planner, WholeTurn) else WholeTurn()
         return planner.plan(self.controller, self.plant.observe(), target, self.knowledge, 0.0, whole=True)
 

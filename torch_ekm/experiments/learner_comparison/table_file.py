@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -60,14 +61,14 @@ def open_table(
         UnknownNameError: the recording has no such topic; the message lists them.
     """
     kind = path.suffix.lower()
-    if kind not in _READERS and (path.is_dir() or kind in _BAGS):
+    if kind not in _READERS and (os.path.isdir(path) or kind in _BAGS):
         if clock is None:
             raise ParameterError(
                 "clock", clock, "a topic whose messages set the rows, such as that of the commands"
             )
         bag = interop.read_bag(path, clock)
         return bag.names, partial(_bag_rows, path, bag)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise DescriptionError(path, "there is no such file")
     if kind not in _READERS:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
