@@ -43,7 +43,7 @@ class Ros2Plant(HandDriver):
             ``command`` (topic), ``kind`` ("trajectory": trajectory_msgs/JointTrajectory; "array":
             std_msgs/Float64MultiArray, in the description's order; "joint_state"), ``fingertips`` (a
             std_msgs/Float64MultiArray, ids are places), ``reliable`` (false: hears all publishers; true: only
-            reliable ones, whose lost messages come again), ``use_sim_time``, ``node``.
+            reliable ones, whose lost messages come again), ``use_sim_time``.
         hand: its description; None: the one that the file names.
         options: see :class:`HandDriver`.
 
@@ -54,7 +54,7 @@ class Ros2Plant(HandDriver):
     """
 
     driver, unit, named = "ros2", "rad", True
-    keys = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time", "node")
+    keys = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time")
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)
@@ -77,9 +77,7 @@ class Ros2Plant(HandDriver):
         parameters = []
         if bus.flag("use_sim_time", False):
             parameters.append(require("rclpy.parameter").Parameter("use_sim_time", value=True))
-        self.node = rclpy.create_node(
-            bus.text("node", "torch_ekm"), context=self._context, parameter_overrides=parameters
-        )
+        self.node = rclpy.create_node("torch_ekm", context=self._context, parameter_overrides=parameters)
         """For further subscriptions, such as :class:`RosPose`."""
         policy = qos.ReliabilityPolicy
         reliable = bus.flag("reliable", False)
