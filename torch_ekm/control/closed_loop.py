@@ -228,7 +228,7 @@ class ClosedLoop:
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
                 said = "; ".join(filter(None, (decision.message, plan.end.message)))
-                return Stop(decision.status, seen, said + ends.surprise + watch.motions.suspects(seen))
+                return Stop(decision.status, seen, said + ends.surprise + watch.suspects(seen))
             halt = watch.command(decision, seen, first=decision.turns and not turns)
             if halt is not None:
                 continue

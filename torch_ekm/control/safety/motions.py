@@ -233,6 +233,11 @@ class MotionTests:
 
     # -- which sensors contradict each other -----------------------------------------------------------------
 
+    @property
+    def agreed(self) -> bool:
+        """Joints, pads and object did, before the first motion."""
+        return self._begun is not None and self.on_surface(self._begun)
+
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
         hand, said = self.hand, self._offset(seen)

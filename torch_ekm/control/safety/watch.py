@@ -225,6 +225,14 @@ class Watch:
         way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
         return f"the object has slid {1e3 * way:.1f} mm and {deg(turn)} farther than predicted"
 
+    def suspects(self, seen: Observation) -> str:
+        """Which sensors contradict each other where the model refuses a state; nothing is learned of the
+        manipulation if the joints and the object agreed at first."""
+        said = self.motions.suspects(seen)
+        if said and self.motions.agreed:
+            self.lie = said
+        return said
+
     def way(self, errors: list[float], decision: Decision, moved: Tensor) -> Objection | None:
         """The object goes away from its target, again and again, while the motors obey. Where it has come
         half the way, no sign is wrong: the grasp turns no further, and the stopping rule says so."""
