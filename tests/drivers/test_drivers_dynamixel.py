@@ -59,7 +59,7 @@ def test_a_motion_over_the_bus(bus, tmp_path) -> None:
         torch.testing.assert_close(after.a, seen.a + radians(5 * DEG, -5 * DEG), atol=TICK / 2, rtol=0)
         plant.observe()  # a sync write has no answer: what comes after it has
         assert left[98] == 0  # at rest no watchdog
-    assert not plant._port.open
+    assert not plant._port._handler.is_open
 
 
 def test_a_servo_that_is_lost_is_named_with_its_line(bus, tmp_path) -> None:

@@ -302,7 +302,7 @@ PRESSED = {
         [(1.0, 2.0, 3.0), (9.0, 9.0, 9.0)],
         "node /tips_[01] and node /tips_[01] send the force of '0'",
     ),
-    "short": ([(1.0, 2.0)], r"\[\[fingertips\]\] 'right': has no force of '2'; it has: 0, 1"),
+    "short": ([(1.0, 2.0)], "/taxels: has no force of '2'; it has: 0, 1"),
     "not finite": ([(1.0, float("nan"), 3.0)], "node /tips_0 sends a force of '1' that is NaN"),
 }
 

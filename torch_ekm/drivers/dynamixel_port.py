@@ -60,11 +60,6 @@ class DynamixelPort:
             raise BusError(port, problem) from error
         self._handler.ser.timeout = _LOOK  # the SDK has 0, and keeps a core busy with asking
 
-    @property
-    def open(self) -> bool:
-        """Whether it was not closed."""
-        return self._handler.is_open
-
     def close(self) -> None:
         """Give the port back."""
         with contextlib.suppress(Exception):

@@ -111,12 +111,10 @@ class Ros2Plant(HandDriver):
                 lambda: self._states.absent("position", self._ids) + quality,
                 self._states_topic,
             )
-            for one, taxels in zip(self.wiring.fingertips, self._taxels, strict=True):
+            for taxels in self._taxels:
                 self._first(
                     lambda taxels=taxels: None not in self._pressed(taxels),
-                    lambda one=one, taxels=taxels: (
-                        f"[[fingertips]] '{one.name}': {self._forces.absent('force', taxels)}{quality}"
-                    ),
+                    lambda taxels=taxels: self._forces.absent("force", taxels) + quality,
                     self._forces.topic,
                 )
             self._first(

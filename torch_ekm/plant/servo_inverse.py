@@ -51,11 +51,6 @@ class ServoInverse(PlantWrapper):
         """v of the last motion [rad]; of a path, its last waypoint."""
         self._told = torch.ones(len(self.servo.names), dtype=torch.bool)  # motors that it tells something of
 
-    @property
-    def stuck(self) -> tuple[str, ...]:
-        """Actuators that do not move however they are commanded."""
-        return tuple(n for n, s in zip(self.servo.names, self.servo.stuck.tolist(), strict=True) if s)
-
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the encoders by ``delta_a`` [rad], wait, read the sensors, learn of the servos.
 
