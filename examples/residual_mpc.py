@@ -73,7 +73,7 @@ class Controller:
     """Multiple shooting with ``f + g``; without a learner, with f alone."""
 
     def __init__(self, learner: SparseOnlineGP | None) -> None:
-        self.g = None if learner is None else to_casadi(learner, variance=False)
+        self.g = None if learner is None else to_casadi(learner)
         n = 0 if self.g is None else self.g.n_parameters
         x, u = ca.SX.sym("x", 6, HORIZON + 1), ca.SX.sym("u", 2, HORIZON)
         start, path, p = ca.SX.sym("start", 6), ca.SX.sym("path", 6, HORIZON + 1), ca.SX.sym("p", n)

@@ -189,7 +189,6 @@ def test_every_optional_module_has_an_extra_that_brings_it() -> None:
         "cv2": "opencv-python",
         "IPython": "ipykernel",
         "rclpy": "ros-rclpy",
-        "rerun": "rerun-sdk",
         **{f"{name}_msgs": f"ros-{name}-msgs" for name in ("sensor", "trajectory", "geometry", "std")},
     }
     for root, extra in _EXTRA_OF.items():

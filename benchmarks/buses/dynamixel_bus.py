@@ -21,11 +21,11 @@ _OUT = 255  # a watchdog that has run out
 # of the X series: name -> (address, bytes)
 REGISTERS = {
     "model": (0, 2), "firmware": (6, 1), "id": (7, 1), "baud": (8, 1), "drive_mode": (10, 1), "mode": (11, 1),
-    "homing": (20, 4), "pwm_limit": (36, 2), "current_limit": (38, 2), "velocity_limit": (44, 4),
-    "max_position": (48, 4), "min_position": (52, 4), "torque": (64, 1), "level": (68, 1),
-    "hardware": (70, 1), "watchdog": (98, 1), "pwm": (100, 2), "current": (102, 2), "velocity": (104, 4),
-    "acceleration": (108, 4), "profile": (112, 4), "goal": (116, 4), "tick": (120, 2), "moving": (122, 1),
-    "load": (126, 2), "position": (132, 4),
+    "secondary": (12, 1), "homing": (20, 4), "pwm_limit": (36, 2), "current_limit": (38, 2),
+    "velocity_limit": (44, 4), "max_position": (48, 4), "min_position": (52, 4), "torque": (64, 1),
+    "level": (68, 1), "hardware": (70, 1), "watchdog": (98, 1), "pwm": (100, 2), "current": (102, 2),
+    "velocity": (104, 4), "acceleration": (108, 4), "profile": (112, 4), "goal": (116, 4), "tick": (120, 2),
+    "moving": (122, 1), "load": (126, 2), "position": (132, 4),
 }  # fmt: skip
 _READ_ONLY = ("model", "firmware", "hardware", "tick", "moving", "load", "position")
 _SIGNED = ("homing", "current", "velocity", "goal", "load", "position", "pwm")
@@ -70,6 +70,7 @@ class DynamixelBus:
         for servo in self.ids:
             for name, value in (
                 ("model", model), ("firmware", 46), ("id", servo), ("baud", 3), ("mode", 3),
+                ("secondary", 255),
                 ("pwm_limit", 885), ("current_limit", current), ("velocity_limit", velocity),
                 ("max_position", _TURN - 1),
             ):  # fmt: skip

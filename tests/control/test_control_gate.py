@@ -175,6 +175,9 @@ LIES = {
     "joints 3 deg too little": (
         Obedient, changed(q=lambda k, q: q - 3 * DEG), Reason.UNSTABLE_GRASP, "joints read -3 deg too much",
         "zero"),
+    "joints 3 deg too far from the middle on": (
+        Obedient, changed(q=lambda k, q: q + 3 * DEG * (k > 2)), Reason.UNSTABLE_GRASP,
+        "joints read 3 deg too much", "zero"),
     "encoders drift": (
         Obedient, changed(a=lambda k, a: a + k * DEG), Reason.ENCODER_DRIFT, "sent nowhere", "magnet"),
 }  # fmt: skip
@@ -213,6 +216,7 @@ def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str)
     plant = kind(held[2], held[0], fault, since=0, dead_zone=1.3 * DEG)
     controller = LookAndMoveController(ekm, held[1])
     loop = ClosedLoop(plant, controller, knowledge=knowledge, planner=OneStep())
+    known = knowledge.servo.estimate.clone()
     done = loop.run(PoseTarget.turned(held[0].state, held[1], degrees=20))
     assert done.reason is (reason or done.reason)
     assert what in done.stop.message
@@ -220,6 +224,8 @@ def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str)
     assert re.search("limit|allowed|Guards", done.stop.message)
     if reason is Reason.WRONG_WAY:
         assert len(done.steps) <= 2
+    if lie.endswith("from the middle on"):
+        assert torch.equal(knowledge.servo.estimate, known)
     assert error_of_a_clean_turn(held, ekm, knowledge) < 1.1 * before
 
 

@@ -83,6 +83,8 @@ def test_knowledge_of_another_hand_and_another_file_are_refused(held, driven, tm
     save(SparseOnlineGP(2, 1), tmp_path / "learner.ekm")
     with pytest.raises(FileFormatError, match="holds a SparseOnlineGP, no HandKnowledge"):
         HandKnowledge.load(tmp_path / "learner.ekm")
+    with pytest.raises(FileFormatError):
+        HandKnowledge.load(tmp_path / ("n" * 300))  # a name that no file can have
 
 
 @pytest.mark.parametrize("spoilt", [math.nan, math.inf])

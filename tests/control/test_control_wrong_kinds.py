@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from light_plant import Obedient
 
-from torch_ekm.control import HandKnowledge, LookAndMoveController, PoseTarget
+from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget
 from torch_ekm.control.reach import reachability
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError
+from torch_ekm.plant import Path, ServoInverse
 from torch_ekm.residual import RecursiveLeastSquares, SparseOnlineGP, default_learner
 
 WRONG = [
@@ -32,6 +34,9 @@ def doors(held) -> dict[str, Door]:
     controller, target = LookAndMoveController(ekm, axis), PoseTarget.turned(state, axis, degrees=5)
     still, moved = torch.zeros(9, dtype=torch.float64), torch.zeros(state.n_s, dtype=torch.float64)
     f = torch.zeros(5, dtype=torch.float64)
+    plant = Obedient(model, seen)
+    inverse = ServoInverse(plant, model.hand)
+    loop = ClosedLoop(plant, controller)
     found: dict[str, Door] = {
         "model": (model, [state, still]),
         "model.linearize": (model.linearize, [state]),
@@ -47,6 +52,9 @@ def doors(held) -> dict[str, Door]:
         "ekm.update": (ekm.update, [state, still, moved]),
         "decide": (controller.decide, [state, seen.a, target]),
         "reachability": (lambda wrong: reachability(controller, seen, wrong), [target]),
+        "loop.plan": (loop.plan, [target]),
+        "plant.command": (inverse.command, [still]),
+        "plant.follow": (lambda wrong: inverse.follow(wrong, lambda seen: True), [Path(still[None], [1.0])]),
         "servo.update": (known.servo.update, [still, still]),
         "forces.update": (known.forces.update, [still, f, f, 0.1]),
         "figures.learn": (known.figures.learn, [lin, still, moved]),

@@ -19,6 +19,7 @@ from torch_ekm.exceptions import (
     NeverAtRestError,
     NonFiniteError,
     ObjectLostError,
+    ParameterError,
     ShapeError,
     StaleReadingError,
 )
@@ -74,6 +75,11 @@ def test_a_command_beyond_the_limits_is_refused_and_nothing_is_sent(driver) -> N
         driver.command(radians(0.0, math.nan))
     with pytest.raises(ShapeError, match="left, right"):
         driver.command(radians(0.1))
+    for wrong in (None, "open", radians(0.1, 0.1).to(torch.complex128), radians(0.1, 0.1).to_sparse()):
+        with pytest.raises(ParameterError, match="delta_a"):
+            driver.command(wrong)
+    with pytest.raises(ParameterError, match="path"):
+        driver.follow(None, lambda seen: True)
     with pytest.raises(CommandRefusedError, match=r"motor 'right': a command of 30 deg.*increment.* 20 deg"):
         driver.command(radians(0.0, 30 * DEG))
     driver.motors = driver.motors.__class__([1000 + 600 * 220 * DEG, 2400.0], 1.0)
@@ -183,6 +189,15 @@ def test_holding_takes_the_middle_of_three_readings(driver) -> None:
     driver.spoil = Published()
     driver.hold()
     assert driver.written[-1][0] == pytest.approx([1600.0, 2400.0])
+
+
+def test_a_hand_that_holds_is_read_once_it_has_yielded(driver) -> None:
+    """A servo under load stands short of its goal: as its goal becomes where it stands, it yields."""
+    send, driver.motors.speed = driver.motors.send, 100.0
+    driver.motors.send = lambda goal: send([at - 6.0 for at in goal])
+    held = driver.command(radians(0.0, 0.0))
+    torch.testing.assert_close(held.a, radians(0.99, 1.01), atol=1e-6, rtol=0)
+    torch.testing.assert_close(driver.observe().a, held.a)
 
 
 def test_a_dry_run_prints_and_sends_nothing(tmp_path) -> None:

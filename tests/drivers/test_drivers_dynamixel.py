@@ -59,7 +59,7 @@ def test_a_motion_over_the_bus(bus, tmp_path) -> None:
         torch.testing.assert_close(after.a, seen.a + radians(5 * DEG, -5 * DEG), atol=TICK / 2, rtol=0)
         plant.observe()  # a sync write has no answer: what comes after it has
         assert left[98] == 0  # at rest no watchdog
-    assert not plant._port.open
+    assert not plant._port._handler.is_open
 
 
 def test_a_servo_that_is_lost_is_named_with_its_line(bus, tmp_path) -> None:
@@ -121,6 +121,20 @@ def test_a_packet_that_is_lost_is_asked_for_again(bus, tmp_path) -> None:
         bus.spoil = lambda packet: b"" if lost and lost.pop() else packet
         plant.observe()
         assert not lost
+
+
+def test_an_answer_that_comes_late_is_passed_over(bus, tmp_path) -> None:
+    """That of servo 2 to an earlier question, before that of servo 1."""
+    with open_at(bus, tmp_path) as plant:
+        late: list[bytes] = []
+        bus.spoil = lambda packet: late.append(_as(packet, 2)) or packet
+        at = plant.observe().a
+        bus.spoil = lambda packet: late.pop(0) + packet if late else packet
+        assert late
+        asked, again = [], plant._port._again
+        plant._port._again = lambda ask: asked.append(0) or again(ask)
+        torch.testing.assert_close(plant.observe().a, at)
+        assert len(asked) == 1, "and nothing is asked again"
 
 
 def test_a_servo_that_has_switched_off_says_why(bus, tmp_path) -> None:
@@ -286,6 +300,18 @@ def test_in_mode_3_a_range_beyond_the_servos_limits_is_refused(tmp_path) -> None
             after = plant.command(radians(0.34, 0.0))  # to the end of the range
             torch.testing.assert_close(after.a[0], radians(87 * DEG)[0], atol=TICK, rtol=0)
         open_at(bus, tmp_path, mode="baud =|mode = 4\nbaud =").close()
+        bus.set(1, "max_position", 100)
+        with pytest.raises(DescriptionError, match=r"0 and 100: write mode = 4, or correct 'zero'"):
+            open_at(bus, tmp_path, mode=mode)
+
+
+def test_a_servo_that_obeys_another_ones_commands_is_refused(tmp_path) -> None:
+    with servos() as bus:
+        bus.set(2, "secondary", 1)
+        with pytest.raises(DescriptionError, match=r"toml:11: .*'right': its Secondary ID is 1"):
+            open_at(bus, tmp_path)
+        bus.set(2, "secondary", 2)
+        open_at(bus, tmp_path).close()
 
 
 @pytest.mark.parametrize("name", ["pwm", "pwm_limit", "current", "current_limit"])

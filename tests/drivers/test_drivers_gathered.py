@@ -22,13 +22,13 @@ def test_each_value_has_its_own_time_and_sender() -> None:
     assert (a.number, a.taken, a.publisher) == (1.0, pytest.approx(9.997), "one")
     assert (b.number, b.taken, b.publisher) == (2.0, 10.01, "two")
     assert gathered.newest("effort", ["a"], 10.02) == [None]
-    assert gathered.absent(["a", "c"]) == "has no position of 'c'; it has: a, other, b"
+    assert gathered.absent("position", ["a", "c"]) == "has no position of 'c'; it has: a, other, b"
 
 
 def test_a_message_that_was_overtaken_changes_nothing_and_one_without_names_is_told() -> None:
     gathered = Gathered("/joint_states", ["a"])
     joints(gathered, "one", 9.99, late=0.001)
-    assert gathered.absent(["a"]) == "has no position of 'a'; it has: messages without names"
+    assert gathered.absent("position", ["a"]) == "has no position of 'a'; it has: messages without names"
     joints(gathered, "one", 10.0, late=0.001, a=2.0)
     joints(gathered, "one", 10.001, late=0.2, a=1.0)
     (a,) = gathered.newest("position", ["a"], 10.01)

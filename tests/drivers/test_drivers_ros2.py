@@ -183,6 +183,13 @@ class Robot:
 
         node.create_timer(0.005, show)
 
+    def presses(self, node: Any, *forces: float) -> None:
+        """An array of taxels."""
+        from std_msgs.msg import Float64MultiArray
+
+        publisher = node.create_publisher(Float64MultiArray, "/taxels", 1)
+        node.create_timer(0.005, lambda: publisher.publish(Float64MultiArray(data=list(forces))))
+
     def close(self) -> None:
         self._context.shutdown()
 
@@ -275,6 +282,49 @@ def test_a_pose_by_best_effort_is_heard(stamped, robot, path) -> None:
         none = WithPose(driver, RosPose(driver, "/other", "camera"), patience=2.0)
         with pytest.raises(BusError, match="/other: no node publishes it"):
             none.reset(seed=0)
+
+
+def test_two_cameras_on_one_topic_are_named(robot, path) -> None:
+    robot.says(robot.node("node_0"), **BOTH)
+    for name in ("camera", "tracker"):
+        robot.shows(robot.node(name), stamped=True)
+    with Ros2Plant(path) as driver:
+        pose = RosPose(driver, "/seen", "camera")
+        time.sleep(0.5)
+        with pytest.raises(
+            BusError, match=r"node /(camera|tracker) and node /(camera|tracker) send the pose"
+        ):
+            pose()
+
+
+PRESSED = {
+    "two nodes": (
+        [(1.0, 2.0, 3.0), (9.0, 9.0, 9.0)],
+        "node /tips_[01] and node /tips_[01] send the force of '0'",
+    ),
+    "short": ([(1.0, 2.0)], "/taxels: has no force of '2'; it has: 0, 1"),
+    "not finite": ([(1.0, float("nan"), 3.0)], "node /tips_0 sends a force of '1' that is NaN"),
+}
+
+
+@pytest.mark.parametrize("name", ["", *PRESSED])
+def test_a_fingertip_is_the_sum_of_its_taxels_by_one_node(name, robot, path) -> None:
+    robot.says(robot.node("node_0"), **BOTH)
+    tips = '[[fingertips]]\nname = "{}"\nid = "{}"\ncount = {}\nper_newton = 10\n'
+    path.write_text(
+        TEXT.replace("[limits]", 'fingertips = "/taxels"\n[limits]')
+        + tips.format("left", 0, 2) + tips.format("right", 2, 1)
+    )  # fmt: skip
+    nodes, words = PRESSED.get(name, ([(1.0, 2.0, 5.0)], ""))
+    for k, forces in enumerate(nodes):
+        robot.presses(robot.node(f"tips_{k}"), *forces)
+    time.sleep(0.3)
+    if words:
+        with pytest.raises(BusError, match=words):
+            look(path)
+    else:
+        with Ros2Plant(path) as driver:
+            torch.testing.assert_close(driver.observe().fingertip_force, radians(0.3, 0.5))
 
 
 def test_one_hand_has_one_master(robot, path) -> None:

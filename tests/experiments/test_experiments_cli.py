@@ -142,10 +142,10 @@ def test_verify(tmp_path: Path) -> None:
     right = CliRunner().invoke(app, ["verify", str(tmp_path)])
     assert right.exit_code == 0, right.output
     assert "\x1b" not in right.output
-    (tmp_path / "index.csv").write_text("")
+    (tmp_path / "trial_000000.h5").write_text("")
     wrong = CliRunner().invoke(app, ["verify", str(tmp_path)])
     assert wrong.exit_code == 1
-    assert re.search(r"index\.csv.*wrong", wrong.output)
+    assert re.search(r"trial_000000\.h5.*wrong", wrong.output)
 
 
 def test_a_page_begins_with_the_answer_and_folds_the_rest(tmp_path: Path) -> None:

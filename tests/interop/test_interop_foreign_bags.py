@@ -16,11 +16,13 @@ from torch_ekm.interop import read_bag
 
 typesys = pytest.importorskip("rosbags.typesys", reason="extra 'interop'")
 from rosbags import rosbag1, rosbag2  # noqa: E402
+from rosbags.convert.converter import LATCH  # noqa: E402
 
 TYPES = {
     kind: typesys.get_typestore(getattr(typesys.Stores, "ROS1_NOETIC" if kind == "ros1" else "LATEST"))
     for kind in ("ros1", "ros2")
 }
+LATCHED: tuple[dict[str, Any], dict[str, Any]] = ({"offered_qos_profiles": LATCH}, {"latching": 1})
 Heard = tuple[float, str, Any]  # logged [s], topic, message without header or (type, its fields)
 
 
@@ -46,7 +48,8 @@ class Maker:
         layout = self.make("std_msgs/msg/MultiArrayLayout", [], 0)
         return self.make("std_msgs/msg/Float64MultiArray", layout, np.array(values, dtype=float))
 
-    def write(self, folder: Path, heard: Iterable[Heard]) -> Path:
+    def write(self, folder: Path, heard: Iterable[Heard], latched: str = "") -> Path:
+        """With the durability of transient local, or ROS 1's latching, for one topic."""
         path = folder / ("own.bag" if self.kind == "ros1" else "own")
         if self.kind == "ros1":
             writer: Any = rosbag1.Writer(path)
@@ -58,7 +61,9 @@ class Maker:
         with writer:
             for logged, topic, message in heard:
                 kind = message.__msgtype__
-                topics[topic] = topics.get(topic) or writer.add_connection(topic, kind, typestore=self.types)
+                if topic not in topics:
+                    named = LATCHED[self.kind == "ros1"] if topic == latched else {}
+                    topics[topic] = writer.add_connection(topic, kind, typestore=self.types, **named)
                 writer.write(topics[topic], round(1e9 * logged), pack(message, kind))
         return path
 
@@ -136,6 +141,18 @@ def test_nothing_is_held_for_ever(ros, tmp_path) -> None:
     steps = own.y[:, 0].tolist()
     assert max(steps) == 1.0, "no motion goes over the pause"
     assert "because /pauses.data[0] is silent or not finite in 16 rows, first at 0.88 s" in own.notes
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_what_is_latched_holds_until_it_is_said_anew(kind: str, tmp_path) -> None:
+    """Three settings within 0.02 s, and nothing for 2 s."""
+    ros = Maker(kind)
+    heard = [(0.5 + 0.01 * k, "/mode", ros.array(k)) for k in range(3)]
+    heard += [(1 + 0.02 * k, "/u", ros.array(k)) for k in range(100)]
+    assert (column(read_bag(ros.write(tmp_path, heard, latched="/mode"), "/u"), "/mode.data[0]") == 2.0).all()
+    (tmp_path / "volatile").mkdir()
+    table = read_bag(ros.write(tmp_path / "volatile", heard), "/u")
+    assert np.isnan(column(table, "/mode.data[0]")).all()
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
@@ -241,13 +258,23 @@ def test_rows_are_in_the_order_of_time_whoever_wrote_them(ros, tmp_path) -> None
     assert not table.run.any()
 
 
-def test_a_time_in_a_csv_that_goes_back_begins_a_run(tmp_path) -> None:
+@pytest.mark.parametrize(
+    "name", ["time [s]", "%time", "__time", "/joint_states/header.stamp", "timestamp_ns"]
+)
+def test_a_time_in_a_csv_that_goes_back_begins_a_run(name, tmp_path) -> None:
     rows = [f"{0.1 * k:.3f},{1000 * run + k},1" for run in (0, 1) for k in range(50)]
     path = tmp_path / "own.csv"
-    path.write_text("\n".join(["time [s],q,u", *rows]))
+    path.write_text("\n".join([f"{name},q,u", *rows]))
     own = load_own(path, Columns(["q"], ["u"], ["q"]))
     assert own.y[:, 0].tolist() == [1.0] * 98
-    assert own.notes == " 2 runs: column 'time [s]' goes back."
-    path.write_text("\n".join(["time,q,u", *rows[::-1]]))
+    assert own.notes == f" 2 runs: column '{name}' goes back."
+    path.write_text("\n".join([f"{name},q,u", *rows[::-1]]))
     own = load_own(path, Columns(["q"], ["u"], ["q"]))
-    assert "'time' goes back in 98 of 100 rows, first in row 2" in own.notes
+    assert f"'{name}' goes back in 98 of 100 rows, first in row 2" in own.notes
+
+
+@pytest.mark.parametrize("end", ["", ".csv", ".mcap", ".db3"])
+def test_a_name_that_no_file_can_have_is_no_file(end: str) -> None:
+    for name in ("n" * 300 + end, "n\0n" + end):
+        with pytest.raises(DescriptionError):
+            load_own(name, Columns(["q"], ["u"], ["q"]), clock="/u")

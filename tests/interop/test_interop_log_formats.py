@@ -104,32 +104,3 @@ def test_lerobot_reads_the_dataset(log: TrialLog, tmp_path: Path) -> None:
     assert dataset.meta.episodes[1]["dataset_from_index"] == 4
     windows = lerobot.LeRobotDataset("of/this", root=folder, delta_timestamps={"action": [0.0, 1.0]})
     assert windows[3]["action_is_pad"].tolist() == [False, True], "an episode ends"
-
-
-def test_rerun_reads_the_recordings(log: TrialLog, tmp_path: Path) -> None:
-    pytest.importorskip("rerun", reason="extra 'interop'")
-    from rerun.chunk import RrdReader
-
-    from torch_ekm.interop import log_to_rerun
-
-    files = log_to_rerun(log, tmp_path / "rrd")
-    assert [file.name for file in files] == [f"trial_{k:06d}.rrd" for k in (0, 1, 4)]
-    trial, said = log.read(0), {}
-    for chunk in RrdReader(files[0]).stream().to_chunks():
-        for name, column in chunk.to_record_batch().to_pydict().items():
-            said.setdefault(chunk.entity_path, {}).setdefault(name, []).extend(column)
-    assert np.array_equal(said["/q"]["Scalars:scalars"], [o.q.tolist() for o in trial.observations])
-    assert np.array_equal(said["/commands"]["Scalars:scalars"], [c.tolist() for c in trial.commands])
-    times = [time.total_seconds() for time in said["/q"]["time"]]
-    assert times == pytest.approx([o.time for o in trial.observations])
-    assert len(said["/commands"]["time"]) == 3
-    position = np.squeeze(said["/object"]["Transform3D:translation"])
-    assert position == pytest.approx(np.stack([o.position.numpy() for o in trial.observations]), abs=1e-6)
-    matrix = np.array(said["/object"]["Transform3D:mat3x3"]).reshape(-1, 3, 3).transpose(0, 2, 1)
-    assert matrix == pytest.approx(np.stack([o.rotation.numpy() for o in trial.observations]), abs=1e-6)
-    assert [text for (text,) in said["/status"]["TextLog:text"]] == ["held"] * 3 + ["lost"]
-    assert "a tendon slipped" in said["/events"]["TextLog:text"][1][0]
-    assert len(said["/raw/image"]["Image:buffer"]) == len(said["/estimate/covariance"]["Tensor:data"]) == 4
-    assert '"reason": "done"' in said["/about"]["TextDocument:text"][0][0]
-    with pytest.raises(ParameterError, match="does not exist yet"):
-        log_to_rerun(log, tmp_path / "rrd")

@@ -57,6 +57,9 @@ REFUSED = {
     "too far": ([0.0, 0.0, -11 * DEG], "a set-point of -61 deg", "-60 to 60 deg"),
     "too few": ([0.1, 0.1], "(2,) numbers", "3 numbers [rad]: thumb, index, middle"),
     "a text": ("open", "a str", "3 numbers [rad]"),
+    "complex": (torch.zeros(3, dtype=torch.complex64), "a Tensor", "3 numbers [rad]"),
+    "sparse": (torch.zeros(3).to_sparse(), "a Tensor", "3 numbers [rad]"),
+    "no 64 bits": (10**400, "a int", "3 numbers [rad]"),
 }
 
 
@@ -68,7 +71,7 @@ def test_what_is_refused_says_what_was_asked_by_whom_and_what_is_allowed(name: s
     plant.a = torch.tensor([0.0, 0.0, -50.0], dtype=torch.float64) * DEG
     gate = Gate(plant, HAND)
     with pytest.raises(CommandRefusedError, match="nothing was sent") as refusal:
-        gate.command(wish if isinstance(wish, str) else torch.tensor(wish, dtype=torch.float64), by="turn")
+        gate.command(torch.tensor(wish, dtype=torch.float64) if isinstance(wish, list) else wish, by="turn")
     assert refusal.value.by == "turn"
     assert refusal.value.asked == asked
     assert allowed in refusal.value.allowed
@@ -213,6 +216,8 @@ UNREADABLE = {
     "an infinite variance": {"info": {"estimate": {"pose_covariance": covariance(math.inf)}}},
     "gradients": {"q": ORIGIN.clone().requires_grad_()},
     "complex numbers": {"a": ORIGIN.to(torch.complex128)},
+    "a sparse tensor": {"q": ORIGIN.to_sparse()},
+    "a complex covariance": {"info": {"estimate": {"pose_covariance": torch.eye(6, dtype=torch.complex64)}}},
     "four joints": {"q": torch.zeros(4)},
     "a stretched object": {"rotation": 2 * EYE},
 }

@@ -85,7 +85,7 @@ def test_files_in_the_wrong_place_are_told(tmp_path: Path) -> None:
     one.write_bytes((other / one.name).read_bytes())  # of another configuration
     assert wrong(folder)[0] == one.name
     one.unlink()
-    assert wrong(folder) == ["index.csv"]
+    assert wrong(folder) == []
     one.write_bytes(kept)
     assert wrong(folder) == []
     (folder / "trial_000005.h5.part").write_bytes(b"killed")
@@ -174,7 +174,7 @@ def test_a_full_disk_is_told_and_leaves_the_log_as_it_was(tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr  # HDF5 would crash the process
     assert "trial_000001.h5 cannot be written: File too large" in done.stdout
     assert wrong(tmp_path) == []
-    assert sorted(contents(tmp_path)) == [".lock", "index.csv", "trial_000000.h5"]
+    assert sorted(contents(tmp_path)) == [".lock", "trial_000000.h5"]
     make(tmp_path)
     assert wrong(tmp_path) == []
 

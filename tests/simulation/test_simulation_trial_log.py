@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torch_ekm.exceptions import DescriptionError, GraspError, OutputError, ParameterError, StateError
+from torch_ekm.exceptions import DescriptionError, GraspError, ParameterError, StateError
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
 from torch_ekm.plant.trial_log import TrialEntry
 from torch_ekm.simulation import PlantParameters, SimulatedHand
@@ -80,31 +80,6 @@ def test_a_run_in_pieces_gives_the_same_log(unbroken, tmp_path):
     (tmp_path / "trial_000002.h5.part").write_bytes(b"killed while this was written")
     (tmp_path / "trial_000077.h5.part").write_bytes(b"killed in a longer run")
     run(tmp_path, 4)
-    assert digests(tmp_path) == digests(unbroken)
-
-
-@pytest.mark.parametrize("index", [None, b"", b"trial,se", "half", "reversed", "one more", "another seed"])
-def test_the_index_is_made_from_the_files(unbroken, tmp_path, index):
-    for path in unbroken.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    place = tmp_path / "index.csv"
-    lines = place.read_bytes().splitlines(keepends=True)
-    if index is None:
-        place.unlink()
-    elif isinstance(index, bytes):
-        place.write_bytes(index)
-    else:
-        text = {
-            "half": b"".join(lines)[:-9],
-            "reversed": b"".join(lines[::-1]),
-            "one more": b"".join(lines) + b"9,9,2,0.5,held,done\n",
-            "another seed": b"".join(lines).replace(b"3,3,2", b"3,8,2"),
-        }
-        place.write_bytes(text[index])
-    written = None if index is None else place.read_bytes()
-    assert TrialLog.open(tmp_path).index == TrialLog.open(unbroken).index
-    assert (place.read_bytes() if place.exists() else None) == written  # reading changes nothing
-    TrialLog(tmp_path, CONFIGURATION).close()
     assert digests(tmp_path) == digests(unbroken)
 
 
@@ -206,11 +181,3 @@ def test_what_is_no_file_is_refused_at_once(tmp_path):
             Trajectory.load(tmp_path / f"trial_{trial:06d}.h5")
     with pytest.raises(DescriptionError, match="no file but"):
         TrialLog.open(tmp_path)
-
-
-def test_an_index_that_is_a_folder_is_named(tmp_path):
-    (tmp_path / "index.csv").mkdir()
-    with pytest.raises(OutputError, match=r"index.csv cannot be written: it is no file"):
-        TrialLog(tmp_path, {})
-    (tmp_path / "index.csv").rmdir()
-    TrialLog(tmp_path, {}).close()

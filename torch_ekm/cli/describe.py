@@ -90,6 +90,8 @@ def check(
     """
     from ..inspection.row import Check
 
+    if plant is None and (dry_run or emulate):
+        raise ParameterError("plant", plant, "given with --dry-run or --emulate: a wiring file")
     if plant is not None:
         if hand:
             raise ParameterError("hand", hand, "left out: with --plant the wiring file names the hand")

@@ -97,7 +97,7 @@ def replay(
 def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
     """Check every byte of a log.
 
-    Its trials, its index, and the files of hand and object that it was made from. Ends with 1 if a file is
+    Its trials, and the files of hand and object that it was made from. Ends with 1 if a file is
     wrong, with 0 if not. "torch-ekm record" makes damaged trials again.
     """
     from ..plant import verify_log

@@ -61,10 +61,13 @@ def drivers(
 
     if new.exists():
         raise ParameterError("new", str(new), "a file that does not exist yet")
-    text = new_wiring(port, hand, (baud,) if baud else BAUDS)
+    with console.status("scanning"):
+        text = new_wiring(port, hand, (baud,) if baud else BAUDS)
     write_whole(new, text)
     say(text)
     say(f"Written:   {new.resolve()}")
+    check = f"torch-ekm check --plant {new}"
+    say(f"Next:      {check} --emulate, {check} --dry-run, {check}")
 
 
 @app.command(name="identify-servo")

@@ -135,6 +135,7 @@ class ClosedLoop:
 
         Nothing moves, and nothing is learned.
         """
+        check_kind("target", target, PoseTarget)
         return self._planned(self.plant.observe(), target)
 
     def _planned(self, seen: Observation, target: PoseTarget) -> Plan:
@@ -238,7 +239,7 @@ class ClosedLoop:
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
-                said = decision.message, plan.end.message, ends.surprise, watch.motions.suspects(seen)
+                said = decision.message, plan.end.message, ends.surprise, watch.suspects(seen)
                 return Stop(decision.status, seen, "; ".join(dict.fromkeys(filter(None, said))))
             halt = gravest(watch.fingertips.before(decision, seen, first=decision.turns and not turns))
             if halt is not None:

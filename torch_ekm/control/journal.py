@@ -49,7 +49,7 @@ class Journal:
         Raises:
             FileFormatError: the file is no journal.
         """
-        return self.path.exists() and not self._read()["reason"]
+        return os.path.exists(self.path) and not self._read()["reason"]
 
     def run(self, loop: ClosedLoop, target: PoseTarget) -> Manipulation:
         """As :meth:`ClosedLoop.run`.
@@ -133,7 +133,7 @@ class Journal:
         write(self.path, {"class": _KIND}, state)
 
     def _read(self) -> dict[str, Any]:
-        if not self.path.exists():
+        if not os.path.exists(self.path):
             raise ResumeError(self.path, "there is no such file")
         described, state = read(self.path)
         if described.get("class") != _KIND or not {"learned", "target", "seen", "reason"} <= {*state}:

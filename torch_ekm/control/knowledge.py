@@ -134,7 +134,7 @@ class HandKnowledge(Recorded, nn.Module):
             return made
         except EKMError as error:
             problem = error.problem if isinstance(error, FileFormatError) else str(error)
-            if previous(path).is_file():
+            if os.path.isfile(previous(path)):
                 problem += f"; the last file that was good is {previous(path)}: copy it here to go on with it"
             raise FileFormatError(path, problem) from None
 

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_kind, check_shape
 from ..description import HandDescription
 from ..exceptions import BusError, CommandRefusedError, NeverAtRestError, StaleReadingError
+from ..kinematics.tensors import as_tensors
 from ..plant import Observation, PlantStatus, Stamps
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
@@ -177,14 +178,14 @@ class HandDriver(ABC):
         """Move the motors by ``delta_a`` [rad] relative to their encoders, wait until they rest, read.
 
         Raises:
-            ShapeError, NonFiniteError: it is not ``n_a`` finite numbers; nothing moves.
+            ParameterError, ShapeError, NonFiniteError: it is not ``n_a`` finite numbers; nothing moves.
             CommandRefusedError: beyond ``limits.increment``, or a motor reads more than 15 deg outside its
                 range; nothing moves.
             StaleReadingError: a sensor sends nothing new.
             BusError: a device does not answer.
             NeverAtRestError: the motion does not end; the motors are commanded to hold.
         """
-        delta = torch.as_tensor(delta_a).detach().cpu().double()
+        delta = as_tensors(delta_a=delta_a)[0].detach().to("cpu", torch.float64)
         check_shape("delta_a", delta, (self.hand.n_a,), f"in order: {', '.join(self.hand.actuator_names)}")
         check_finite("delta_a", delta)
         return self._go(Waypoints.through(delta[None], self.limits.rate), None)
@@ -200,7 +201,8 @@ class HandDriver(ABC):
             EKMError: see :meth:`command`; ``limits.increment`` holds for each piece. After a failure that
                 is not of the bus the motors are commanded to hold.
         """
-        check_shape("waypoints", path.waypoints[0], (self.hand.n_a,), "for each waypoint")
+        waypoints = check_kind("path", path, Waypoints).waypoints
+        check_shape("waypoints", waypoints[0], (self.hand.n_a,), "for each waypoint")
         return self._go(path, watch)
 
     def _go(self, path: Waypoints, watch: Callable[[Observation], bool] | None) -> Observation:
@@ -233,6 +235,7 @@ class HandDriver(ABC):
                 raise
         else:
             self.hold()
+            self._rest(time.monotonic())  # a motor under load yields where its goal becomes where it stands
         self._last = self._newer(reading=self._last)
         return self._observation(self._last)
 

@@ -26,10 +26,10 @@ _GOAL = 112  # Profile Velocity, Goal Position (int32): 8 bytes
 _STATE = (120, 16)  # Realtime Tick, moving at 2, current (int16) at 6, position (int32) at 12
 _REGISTERS = {
     "Model Number": (0, 2), "Firmware Version": (6, 1), "Drive Mode": (10, 1), "Operating Mode": _MODE,
-    "Homing Offset": (20, 4), "PWM Limit": (36, 2), "Current Limit": (38, 2), "Velocity Limit": (44, 4),
-    "Max Position Limit": (48, 4), "Min Position Limit": (52, 4), "Torque Enable": _TORQUE,
-    "Bus Watchdog": _WATCHDOG, "Goal PWM": (100, 2), "Goal Current": _CURRENT, "Goal Position": (116, 4),
-    "Present Position": (132, 4),
+    "Secondary ID": (12, 1), "Homing Offset": (20, 4), "PWM Limit": (36, 2), "Current Limit": (38, 2),
+    "Velocity Limit": (44, 4), "Max Position Limit": (48, 4), "Min Position Limit": (52, 4),
+    "Torque Enable": _TORQUE, "Bus Watchdog": _WATCHDOG, "Goal PWM": (100, 2), "Goal Current": _CURRENT,
+    "Goal Position": (116, 4), "Present Position": (132, 4),
 }  # fmt: skip
 _ALL = (0, 136)
 _MAY_CHANGE = ("Bus Watchdog", "Goal Position", "Present Position")
@@ -152,6 +152,9 @@ class DynamixelPlant(HandDriver):
             most = found["Current Limit"] * model.unit_ma
             if current_ma and mode != 5:
                 raise bus.error(f"'current_ma' limits nothing in mode {mode}: remove it; {name}")
+            if (other := found["Secondary ID"]) in {*self._ids} - {int(one.id)}:
+                problem = f"its Secondary ID is {other}: it obeys that motor's commands, too; set it to 255"
+                raise self.wiring.error("motors", one, problem, "id")
             if current_ma > most:
                 problem = f"'current_ma' must be at most {most:.6g}, got {current_ma:g}"
                 raise bus.error(f"{problem}: {name}, and this is its Current Limit")
@@ -171,6 +174,8 @@ class DynamixelPlant(HandDriver):
                 ends = [math.degrees(min(max(one.value(x), one.lower), one.upper)) for x in (low, high)]
                 problem = f"its range is {least} to {most} ticks, its Position Limits are {low} and {high}"
                 remedy = f"write range_deg = [{min(ends):.4g}, {max(ends):.4g}], or mode = 4"
+                if ends[0] == ends[1]:  # they have nothing in common
+                    remedy = "write mode = 4, or correct 'zero'"
                 raise self.wiring.error("motors", one, f"{problem}: {remedy}", "range_deg")
 
     def _able_to_move(self, current_ma: float) -> None:

@@ -60,11 +60,6 @@ class DynamixelPort:
             raise BusError(port, problem) from error
         self._handler.ser.timeout = _LOOK  # the SDK has 0, and keeps a core busy with asking
 
-    @property
-    def open(self) -> bool:
-        """Whether it was not closed."""
-        return self._handler.is_open
-
     def close(self) -> None:
         """Give the port back."""
         with contextlib.suppress(Exception):
@@ -122,11 +117,15 @@ class DynamixelPort:
     # -- inside -------------------------------------------------------------------------------------
 
     def _answer(self, servo: int, size: int) -> bytes:
-        what = self._name(servo)
+        what, others = self._name(servo), set()
         packet, result = self._packets.rxPacket(self._handler, False)
+        while result == self._sdk.COMM_SUCCESS and packet[4] != servo:  # it may answer an earlier question
+            others.add(packet[4])
+            packet, result = self._packets.rxPacket(self._handler, False)
+        if others and result != self._sdk.COMM_SUCCESS:
+            instead = ", ".join(map(str, sorted(others)))
+            raise BusError(what, f"servo {instead} answers in its place: old or wrong packets")
         self._check(result, what)
-        if packet[4] != servo:
-            raise BusError(what, f"servo {packet[4]} answers in its place: an old or wrong packet")
         if packet[5] + (packet[6] << 8) != size + 4:
             raise BusError(what, "answers with a packet that is too short or too long")
         self._healthy(servo, packet[8])

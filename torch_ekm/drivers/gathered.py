@@ -72,7 +72,7 @@ class Gathered:
         late: float | None,
         arrived: float,
     ) -> None:
-        """A message: of each part as many numbers as names, or none."""
+        """A message: of each part as many numbers as names, or none; those of the first one are finite."""
         with self._lock:
             taken = self.clocks.setdefault(publisher, SenderClock()).taken(late, arrived)
             self.heard.update(dict.fromkeys(names or [_NAMELESS], arrived))
@@ -96,9 +96,10 @@ class Gathered:
             return f"the name '{', '.join(twice)}' twice in one message"
         if uneven := [f"{len(x)} {part}s" for part, x in parts.items() if len(x) not in (0, len(names))]:
             return f"{len(names)} names and {', '.join(uneven)}"
-        for name, number in zip(names, parts["position"], strict=False):
+        part, numbers = next(iter(parts.items()))
+        for name, number in zip(names, numbers, strict=False):
             if name in self.wanted and not math.isfinite(number):
-                return f"a position of '{name}' that is NaN or infinite"
+                return f"a {part} of '{name}' that is NaN or infinite"
         return ""
 
     def newest(self, part: str, names: Sequence[str], now: float) -> list[Value | None]:
@@ -123,9 +124,9 @@ class Gathered:
                 raise BusError(self.topic, problem)
         return [values[-1] if values else None for values in found]
 
-    def absent(self, names: Sequence[str]) -> str:
+    def absent(self, part: str, names: Sequence[str]) -> str:
         """Which of these nobody sends, and what is sent instead."""
-        missing = ", ".join(f"'{name}'" for name in names if ("position", name) not in self._values)
+        missing = ", ".join(f"'{name}'" for name in names if (part, name) not in self._values)
         if not self.heard:
             return "nothing is received: is its publisher running?"
-        return f"has no position of {missing}; it has: {', '.join(self.heard)}"
+        return f"has no {part} of {missing}; it has: {', '.join(self.heard)}"

@@ -16,14 +16,16 @@ from ..description import HandDescription
 from ..exceptions import BusError
 from .bus_reading import BusReading
 from .driver import HandDriver
-from .gathered import Gathered, SenderClock, Value
+from .gathered import Gathered, Value
 from .one_master import OneMaster
 from .pose import Sighting
+from .wiring import Channel
 
 _KINDS = ("trajectory", "array", "joint_state")
 _TIMEOUT = 5.0  # [s] for the first message and the first subscriber: discovery takes a while
 _DISCOVERED = 0.4  # [s] by then a node that runs is known
 _ONLY_RELIABLE = " ([bus] reliable = true hears reliable publishers only)"
+_POSE = ("x", "y", "z", "orientation.x", "orientation.y", "orientation.z", "orientation.w")
 _SYNCHRONOUS = 0.02  # [s] of clocks: less is not worth a note
 
 
@@ -41,7 +43,7 @@ class Ros2Plant(HandDriver):
             ``command`` (topic), ``kind`` ("trajectory": trajectory_msgs/JointTrajectory; "array":
             std_msgs/Float64MultiArray, in the description's order; "joint_state"), ``fingertips`` (a
             std_msgs/Float64MultiArray, ids are places), ``reliable`` (false: hears all publishers; true: only
-            reliable ones, whose lost messages come again), ``use_sim_time``, ``node``.
+            reliable ones, whose lost messages come again), ``use_sim_time``.
         hand: its description; None: the one that the file names.
         options: see :class:`HandDriver`.
 
@@ -52,7 +54,7 @@ class Ros2Plant(HandDriver):
     """
 
     driver, unit, named = "ros2", "rad", True
-    keys = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time", "node")
+    keys = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time")
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)
@@ -75,9 +77,7 @@ class Ros2Plant(HandDriver):
         parameters = []
         if bus.flag("use_sim_time", False):
             parameters.append(require("rclpy.parameter").Parameter("use_sim_time", value=True))
-        self.node = rclpy.create_node(
-            bus.text("node", "torch_ekm"), context=self._context, parameter_overrides=parameters
-        )
+        self.node = rclpy.create_node("torch_ekm", context=self._context, parameter_overrides=parameters)
         """For further subscriptions, such as :class:`RosPose`."""
         policy = qos.ReliabilityPolicy
         reliable = bus.flag("reliable", False)
@@ -85,12 +85,15 @@ class Ros2Plant(HandDriver):
             depth=50, reliability=policy.RELIABLE if reliable else policy.BEST_EFFORT
         )
         self._ids = [str(one.id) for one in (*self.wiring.motors, *self.wiring.joints)]
-        self._states = Gathered(self._states_topic, self._ids, self._called)
-        self._force: tuple[Sequence[float], float] | None = None
+        self._states = self.gathered(self._states_topic, self._ids)
         self.subscribe(self._messages["sensor"].JointState, self._states_topic, self._take)
-        if self.wiring.fingertips:
+        self._taxels = [self._places(one) for one in self.wiring.fingertips]
+        if self._taxels:
+            self._forces = self.gathered(
+                bus.text("fingertips"), [k for taxels in self._taxels for k in taxels]
+            )
             array = self._messages["std"].Float64MultiArray
-            self.subscribe(array, bus.text("fingertips"), self._take_force)
+            self.subscribe(array, self._forces.topic, self._take_force)
         kind = {"trajectory": self._messages["trajectory"].JointTrajectory,
                 "array": self._messages["std"].Float64MultiArray,
                 "joint_state": self._messages["sensor"].JointState}[self._kind]  # fmt: skip
@@ -102,10 +105,18 @@ class Ros2Plant(HandDriver):
         try:
             if not self.dry_run:
                 self._master = OneMaster(f"{topic} of domain {os.environ.get('ROS_DOMAIN_ID', 0)}")
+            quality = _ONLY_RELIABLE if reliable else ""
             self._first(
                 lambda: None not in self._newest("position", self._ids),
-                lambda: self._states.absent(self._ids) + (_ONLY_RELIABLE if reliable else ""),
+                lambda: self._states.absent("position", self._ids) + quality,
+                self._states_topic,
             )
+            for taxels in self._taxels:
+                self._first(
+                    lambda taxels=taxels: None not in self._pressed(taxels),
+                    lambda taxels=taxels: self._forces.absent("force", taxels) + quality,
+                    self._forces.topic,
+                )
             self._first(
                 lambda: self.dry_run or self._publisher.get_subscription_count() > 0,
                 lambda: "no node subscribes to it: is the controller running?",
@@ -122,7 +133,7 @@ class Ros2Plant(HandDriver):
                     way = "behind" if clock.behind > 0 else "ahead of"
                     off = f"{abs(clock.behind):.3g} s {way} this machine's"
                     self.notes.append(
-                        f"the clock of {self._called(sender)} is {off}, as measured from arrivals"
+                        f"the clock of {self._states.called(sender)} is {off}, as measured from arrivals"
                     )
         except BaseException:
             self._release()
@@ -161,25 +172,41 @@ class Ros2Plant(HandDriver):
         late = 1e-9 * (self.node.get_clock().now().nanoseconds - stamp) - waited if stamp else None
         return late, now - waited
 
-    def _take(self, message: Any, info: Any) -> None:
-        late, arrived = self.lateness(message.header, info)
-        parts = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
-        sender = (info.get("publisher_gid") or {}).get("data") or tuple(message.name)
-        self._states.take(message.name, parts, sender, late, arrived)
+    def gathered(self, topic: str, wanted: Sequence[str]) -> Gathered:
+        """For what comes by a topic; its publishers are called by their nodes."""
 
-    def _called(self, sender: Any) -> str:
-        """Node of a publisher; where the middleware does not tell, what it sends."""
-        there = {gid: name for name, gid in self.publishers(self._states_topic)}
-        return f"node {there[sender]}" if sender in there else f"a node ({sender!r})"
+        def called(sender: Any) -> str:
+            there = {gid: name for name, gid in self.publishers(topic)}
+            return f"node {there[sender]}" if sender in there else f"a node ({sender!r})"
+
+        return Gathered(topic, wanted, called)
+
+    def _take(self, message: Any, info: Any) -> None:
+        parts = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
+        sender = sender_of(info) or tuple(message.name)  # where the middleware does not tell, what it sends
+        self._states.take(message.name, parts, sender, *self.lateness(message.header, info))
 
     def _take_force(self, message: Any, info: Any) -> None:
-        self._force = message.data, self.lateness(None, info)[1]
+        names = [str(k) for k in range(len(message.data))]
+        self._forces.take(names, {"force": message.data}, sender_of(info), *self.lateness(None, info))
 
-    def _first(self, came: Callable[[], bool], problem: Callable[[], str], topic: str = "") -> None:
+    def _places(self, one: Channel) -> list[str]:
+        """Of a fingertip's taxels in the array."""
+        if not str(one.id).isdecimal():
+            raise self.wiring.error(
+                "fingertips", one, f"'id' must be a place in the array, got '{one.id}'", "id"
+            )
+        return [str(int(one.id) + k) for k in range(one.count)]
+
+    def _pressed(self, taxels: Sequence[str]) -> list[Value | None]:
+        return self._forces.newest("force", taxels, time.monotonic())
+
+    @staticmethod
+    def _first(came: Callable[[], bool], problem: Callable[[], str], topic: str) -> None:
         end = time.monotonic() + _TIMEOUT
         while not came():
             if time.monotonic() > end:
-                raise BusError(topic or self._states_topic, problem())
+                raise BusError(topic, problem())
             time.sleep(0.005)
 
     def _newest(self, part: str, ids: Sequence[str]) -> list[Value | None]:
@@ -207,32 +234,18 @@ class Ros2Plant(HandDriver):
             abs(x) / one.per_unit for x, one in zip(beside("velocity"), self.wiring.motors, strict=True)
         ]
         load = beside("effort")
-        force, force_taken = [], math.inf
-        if self.wiring.fingertips:
-            self._first(lambda: self._force is not None, lambda: "no fingertips are received")
-            data, force_taken = self._force or ((), 0.0)
-            force = self._forces(data)
+        pressed = [[one for one in self._pressed(k) if one is not None] for k in self._taxels]
         return BusReading(
             motors=[one.number for one in motors],
             taken=taken,
             moving=any(x > still for x in speeds),
             joints=[one.number for one in joints],
             joints_taken=min((one.taken for one in joints), default=math.inf),
-            fingertips=force,
-            fingertips_taken=force_taken,
+            fingertips=[sum(one.number for one in tip) for tip in pressed],
+            fingertips_taken=min((one.taken for tip in pressed for one in tip), default=math.inf),
             load=load if all(map(math.isfinite, load)) else (),
             oldest=f"'{self._ids[oldest]}'",
         )
-
-    def _forces(self, data: Sequence[float]) -> list[float]:
-        found = []
-        for one in self.wiring.fingertips:
-            place = str(one.id)
-            if not place.isdigit() or int(place) + one.count > len(data):
-                problem = f"{len(data)} numbers, [[fingertips]] '{one.name}' has id '{place}'"
-                raise BusError("fingertips", problem)
-            found.append(float(sum(data[int(place) : int(place) + one.count])))
-        return found
 
     def _write(self, goal: Sequence[float], seconds: float) -> None:
         goal = [float(x) for x in goal]
@@ -260,6 +273,11 @@ class Ros2Plant(HandDriver):
             self._master.release()
 
 
+def sender_of(info: Any) -> Any:
+    """Which publisher a message is of, as far as the middleware tells."""
+    return (info.get("publisher_gid") or {}).get("data")
+
+
 class RosPose:
     """The object's pose from a topic of geometry_msgs/PoseStamped; a source for :class:`WithPose`.
 
@@ -270,33 +288,37 @@ class RosPose:
     """
 
     def __init__(self, plant: Ros2Plant, topic: str, frame: str) -> None:
-        self._plant, self._topic, self._frame = plant, topic, frame
-        self._clock, self._began = SenderClock(), time.monotonic()
-        self._newest: tuple[Any, float] | None = None
+        self._plant, self._topic, self._frame, self._other = plant, topic, frame, ""
+        self._poses, self._began = plant.gathered(topic, _POSE), time.monotonic()
         plant.subscribe(require("geometry_msgs.msg").PoseStamped, topic, self._take)
 
     def _take(self, message: Any, info: Any) -> None:
-        self._newest = message, self._clock.taken(*self._plant.lateness(message.header, info))
+        there = message.header.frame_id
+        self._other = "" if there == self._frame else there or "(none)"
+        if self._other:
+            return
+        o, r = message.pose.position, message.pose.orientation
+        numbers = {"pose": (o.x, o.y, o.z, r.x, r.y, r.z, r.w)}
+        self._poses.take(_POSE, numbers, sender_of(info), *self._plant.lateness(message.header, info))
 
     def __call__(self) -> Sighting | None:
         """The newest pose, dated by its stamp, or by its arrival without one; None: there was none yet.
 
         Raises:
-            BusError: nobody publishes the topic; it is in another frame, or its orientation is no rotation.
+            BusError: nobody publishes the topic, or two nodes do; it is in another frame, not finite, or its
+                orientation is no rotation.
         """
-        if self._newest is None:
+        if self._other:
+            problem = f"the pose is in the frame '{self._other}', it should be in '{self._frame}'"
+            raise BusError(self._topic, problem)
+        newest = [one for one in self._poses.newest("pose", _POSE, time.monotonic()) if one is not None]
+        if not newest:
             if time.monotonic() - self._began > _DISCOVERED and not self._plant.publishers(self._topic):
                 raise BusError(self._topic, "no node publishes it: is the camera's node running?")
             return None
-        message, taken = self._newest
-        if message.header.frame_id != self._frame:
-            there = message.header.frame_id
-            raise BusError(
-                self._topic, f"the pose is in the frame '{there}', it should be in '{self._frame}'"
-            )
-        o, r = message.pose.position, message.pose.orientation
-        if not abs(r.w**2 + r.x**2 + r.y**2 + r.z**2 - 1) < 1e-3:
+        numbers = [one.number for one in newest]
+        if not abs(sum(x**2 for x in numbers[3:]) - 1) < 1e-3:
             raise BusError(self._topic, "the orientation is no unit quaternion")
-        rotation = require("scipy.spatial.transform").Rotation.from_quat([r.x, r.y, r.z, r.w])
-        position = torch.tensor([o.x, o.y, o.z], dtype=torch.float64)
-        return Sighting(position, torch.from_numpy(rotation.as_matrix()), taken)
+        rotation = require("scipy.spatial.transform").Rotation.from_quat(numbers[3:])
+        position = torch.tensor(numbers[:3], dtype=torch.float64)
+        return Sighting(position, torch.from_numpy(rotation.as_matrix()), newest[0].taken)

@@ -35,7 +35,7 @@ class YarpPlant(HandDriver):
 
     Args:
         wiring: the TOML file; ``[bus]``: ``name_server`` ("host:port"), ``part`` ("/icub/right_arm"),
-            ``analog``, ``skin`` (names of ports), ``speed_deg`` (of the position controllers, [limits] rate).
+            ``analog``, ``skin`` (names of ports).
         hand: its description; None: the one that the file names.
         options: see :class:`HandDriver`.
 
@@ -45,7 +45,7 @@ class YarpPlant(HandDriver):
     """
 
     driver, unit, per_rad = "yarp", "deg", 180 / math.pi
-    keys = ("name_server", "part", "analog", "skin", "speed_deg")
+    keys = ("name_server", "part", "analog", "skin")
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)
@@ -65,7 +65,7 @@ class YarpPlant(HandDriver):
                 if getattr(self.wiring, kind):
                     self._streams[kind] = _Stream(_Connection(bus.text(key), self._find))
             if not self.dry_run:
-                speed = bus.number("speed_deg", math.degrees(self.limits.rate), positive=True)
+                speed = math.degrees(self.limits.rate)  # of the position controllers
                 for axis in self._axes:
                     self._set(f"[icmd] [cmod] {axis} [pos]")
                     self._set(f"[vel] {axis} {speed:.6g}")

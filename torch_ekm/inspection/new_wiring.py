@@ -15,7 +15,7 @@ from ..exceptions import BusError
 BAUDS = (57600, 1000000, 4000000, 3000000, 2000000, 115200, 9600)
 _TURN = 4096
 _HEAD = """\
-# Written from a scan. Check it: torch-ekm check --plant THIS_FILE --dry-run, then without --dry-run.
+# Written from a scan: check it with torch-ekm check --plant.
 [hand]
 driver = "dynamixel"
 description = "{hand}"
@@ -30,10 +30,13 @@ rate_deg = 60
 """
 _MOTOR = """
 [[motors]]       # {servo}
-name = "{name}"  # in the order of ids: a guess
+# in the order of ids: a guess
+name = "{name}"
 id = {id}
-sign = 1         # -1 where the servo counts the other way
-zero = {zero}    # as it stood when scanned, the hand at rest; tendons: torch-ekm slack --write
+# -1 where the servo counts the other way
+sign = 1
+# as it stood when scanned, the hand at rest; tendons: torch-ekm slack --write
+zero = {zero}
 """
 
 
@@ -74,7 +77,7 @@ def new_wiring(port: str, hand: str, bauds: tuple[int, ...] = BAUDS) -> str:
         for one, model in zip(found, models, strict=True)
     )
     current = (
-        f"# current_ma = ...  # the most that a motor pulls with; they allow {most:.0f}\n" if most else ""
+        f"# current_ma = ...  # the most that a motor pulls with; they allow {most:.0f} mA\n" if most else ""
     )
     motors = [
         _MOTOR.format(

@@ -1,4 +1,4 @@
-"""Both ways between learners and other libraries: river, CasADi, ROS, rerun, LeRobot.
+"""Both ways between learners and other libraries: river, CasADi, ROS, LeRobot.
 
 Learners of this package in their interfaces, and theirs as a :class:`~torch_ekm.ResidualLearner` (extra
 ``peers``). What needs another library is imported when it is first asked for, by its name here; a missing
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from .casadi_residual import CasadiResidual as to_casadi  # noqa: N813
     from .lerobot_dataset import log_to_lerobot
     from .mcap_log import log_to_mcap
-    from .rerun_log import log_to_rerun
     from .river_regressor import RiverRegressor as as_river  # noqa: N813
 
 _ASKED_FOR = {
@@ -26,7 +25,6 @@ _ASKED_FOR = {
     "as_river": ("river_regressor", "RiverRegressor"),
     "log_to_lerobot": ("lerobot_dataset", "log_to_lerobot"),
     "log_to_mcap": ("mcap_log", "log_to_mcap"),
-    "log_to_rerun": ("rerun_log", "log_to_rerun"),
     "read_bag": ("bags", "read_bag"),
     "to_casadi": ("casadi_residual", "CasadiResidual"),
 }
@@ -46,7 +44,6 @@ __all__ = [
     "as_river",
     "log_to_lerobot",
     "log_to_mcap",
-    "log_to_rerun",
     "read_bag",
     "to_casadi",
 ]

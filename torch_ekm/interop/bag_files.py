@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
 import struct
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ def check_bag(path: Path) -> None:
         DescriptionError: there is none, it begins otherwise, a database has more than tables, or a chunk
             unpacks to more than 64 MiB and 32 times its size.
     """
-    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+    for file in sorted(path.iterdir()) if os.path.isdir(path) else [path]:
         kind = file.suffix.lower()
         check_file(file, "recording", _LARGEST_LIST if kind == ".yaml" else _LARGEST)
         if kind not in _FIRST:

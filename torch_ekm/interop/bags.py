@@ -51,7 +51,8 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
     Nothing that was measured later enters a row. A message counts from its ``header.stamp`` on, where that
     runs with the log's clock, at most 1 s before it; else from when it was logged. A value is NaN before its
     first message, where its array has got shorter, and once it is older than ten mean intervals of its
-    column. Texts, headers and fields of more than 64 numbers are left out.
+    column; one of a latched topic (transient local) holds until the next. Texts, headers and fields of more
+    than 64 numbers are left out.
 
     Args:
         path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
@@ -74,8 +75,9 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
                 if topic not in there:
                     raise UnknownNameError("topic", topic, there)
             wanted = {clock, *(topics or there)}
+            latched = {connection.topic for connection in reader.connections if _latched(connection.ext)}
             for place, (topic, kind, logged, raw) in enumerate(_written(reader, wanted)):
-                one = heard.setdefault(topic, _Topic(topic))
+                one = heard.setdefault(topic, _Topic(topic, topic in latched))
                 one.take(place, logged, reader.deserialize(raw, kind))
     except (UnknownNameError, DescriptionError):
         raise
@@ -93,6 +95,8 @@ class _Topic:
     """What was heard of one topic, in the order of writing."""
 
     name: str
+    latched: bool
+    """A value is said once, for all who come later."""
     place: list[int] = field(default_factory=list)
     """In the file."""
     logged: list[int] = field(default_factory=list)
@@ -160,7 +164,8 @@ def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
     for topic in order:
         for name, (at, given) in heard[topic].columns.items():
             taken, order = when[topic][0][at], (np.arange(len(rows)), row_of[at]) if topic == clock else None
-            value, age = _held(time, runs, taken, run[topic][at], np.array(given), order)
+            held = np.inf if heard[topic].latched else _HELD
+            value, age = _held(time, runs, taken, run[topic][at], np.array(given), order, held)
             names.append(name)
             values.append(value)
             ages.append(age)
@@ -171,17 +176,23 @@ def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
 
 
 def _held(
-    time: Array, runs: Numbers, at: Array, run: Numbers, given: Array, places: tuple[Numbers, Numbers] | None
+    time: Array,
+    runs: Numbers,
+    at: Array,
+    run: Numbers,
+    given: Array,
+    places: tuple[Numbers, Numbers] | None,
+    held: float,
 ) -> tuple[Array, Array]:
     """Of each row the newest value of its run, by times or by ``places`` of rows and values; and its age.
 
-    NaN: there is none, or it is too old.
+    NaN: there is none, or it is older than ``held`` mean intervals.
     """
     key, place = (time, at) if places is None else places
     order = np.lexsort((place, run))
     at, place, run, given = at[order], place[order], run[order], given[order]
     steps = np.diff(at)[np.diff(run) == 0]
-    most = _HELD * steps.mean() if len(steps) > 1 else np.inf
+    most = held * max(steps.mean(), 1e-9) if len(steps) > 1 else np.inf
     value, age = np.full(len(time), np.nan), np.full(len(time), np.nan)
     for one in np.unique(run):
         mine, rows = run == one, np.flatnonzero(runs == one)
@@ -191,6 +202,12 @@ def _held(
         age[rows] = time[rows] - at[mine][last]
         value[rows] = np.where(age[rows] <= most, given[mine][last], np.nan)
     return value, age
+
+
+def _latched(ext: Any) -> bool:
+    """By the header of a connection of ROS 1, or the quality of ROS 2."""
+    offered = getattr(ext, "offered_qos_profiles", ())
+    return bool(getattr(ext, "latching", 0)) or any(x.durability.name == "TRANSIENT_LOCAL" for x in offered)
 
 
 def _written(reader: Any, topics: set[str]) -> Iterator[tuple[str, str, int, bytes]]:

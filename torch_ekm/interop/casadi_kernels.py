@@ -52,11 +52,11 @@ class Inputs:
         return np.concatenate([tensor.ravel(order="F") for tensor in tensors])
 
 
-_Function = Callable[["ca.SX"], "ca.SX"]
+Function = Callable[["ca.SX"], "ca.SX"]
 
 
-def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> tuple[_Function, _Function]:
-    """``k(X, z)`` ``(M, 1)`` and ``k(z, z)``, functions of a column z.
+def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> Function:
+    """``k(X, z)`` ``(M, 1)``, of a column z.
 
     Args:
         kernel: of one model.
@@ -67,9 +67,20 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
         ParameterError: a kernel of another kind.
     """
     if isinstance(kernel, ActionLinearKernel):
-        return _action_linear(kernel, basis, inputs)
+        n = kernel.state_features
+        state = covariance(kernel.state_kernel, lambda: basis()[:, :n], inputs)
+        actions = inputs.take("actions", lambda: basis()[:, n:])
+        variance = inputs.take("action_variance", lambda: kernel.action_variance)
+        return lambda z: state(z[:n]) * (actions @ (variance * z[n:]))
     if isinstance(kernel, LinearKernel):
-        return _linear(kernel, basis, inputs)
+        points = inputs.take("points", basis)
+        v = inputs.take("variance", lambda: kernel.variance)
+        slopes = inputs.take("slope_variance", lambda: kernel.slope_variance)
+        return lambda z: v * (1.0 + points @ (slopes * z))
+    return _stationary(kernel, basis, inputs)
+
+
+def _stationary(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> Function:
     base: Any = kernel.base if isinstance(kernel, DeepKernel) else kernel
     if type(base) not in (SquaredExponential, Matern32):
         valid = "squared exponential, Matern, action-linear, linear or deep, and no subclass"
@@ -91,10 +102,10 @@ def covariance(kernel: Kernel, basis: Callable[[], Tensor], inputs: Inputs) -> t
         away = points - ca.repmat(embed(z).T, points.shape[0], 1)
         return v * phi(ca.sum2(away * away))
 
-    return column, lambda z: v
+    return column
 
 
-def _phi(kernel: Kernel) -> _Function:
+def _phi(kernel: Kernel) -> Function:
     """Correlation at a squared scaled distance."""
     if isinstance(kernel, SquaredExponential):
         return lambda d2: ca.exp(-0.5 * d2)
@@ -106,30 +117,7 @@ def _phi(kernel: Kernel) -> _Function:
     return matern
 
 
-def _action_linear(
-    kernel: ActionLinearKernel, basis: Callable[[], Tensor], inputs: Inputs
-) -> tuple[_Function, _Function]:
-    n = kernel.state_features
-    state, of_state = covariance(kernel.state_kernel, lambda: basis()[:, :n], inputs)
-    actions = inputs.take("actions", lambda: basis()[:, n:])
-    variance = inputs.take("action_variance", lambda: kernel.action_variance)
-    return (
-        lambda z: state(z[:n]) * (actions @ (variance * z[n:])),
-        lambda z: of_state(z[:n]) * ca.sum1(variance * z[n:] * z[n:]),
-    )
-
-
-def _linear(kernel: LinearKernel, basis: Callable[[], Tensor], inputs: Inputs) -> tuple[_Function, _Function]:
-    points = inputs.take("points", basis)
-    v = inputs.take("variance", lambda: kernel.variance)
-    slopes = inputs.take("slope_variance", lambda: kernel.slope_variance)
-    return (
-        lambda z: v * (1.0 + points @ (slopes * z)),
-        lambda z: v * (1.0 + ca.sum1(slopes * z * z)),
-    )
-
-
-def _embedding(kernel: DeepKernel, inputs: Inputs) -> _Function:
+def _embedding(kernel: DeepKernel, inputs: Inputs) -> Function:
     """``[z / L, net(z)]``, weights being inputs."""
     w = inputs.take("inverse_lengthscale", lambda: kernel.base.log_lengthscale.neg().exp())
     weights = [inputs.take("weight", lambda one=one: one) for one in kernel.weights]

@@ -89,13 +89,6 @@ class RiverRegressor(base.Regressor):
             return None
         return float(self._regressor.predict(self._columns.row(x)[None])[0][0, 0])
 
-    def predict_interval_one(self, x: dict, level: float = 0.95) -> tuple[float, float] | None:
-        """(low, high) that is to hold ``level`` of the samples; None before the first one."""
-        if self._regressor is None or self._columns is None:
-            return None
-        low, high = self._regressor.interval(self._columns.row(x)[None], level)
-        return float(low[0, 0]), float(high[0, 0])
-
     @classmethod
     def _unit_test_params(cls) -> Iterator[dict[str, Any]]:
         yield {"learner": None}

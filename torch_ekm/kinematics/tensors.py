@@ -18,15 +18,16 @@ def as_tensors(**values: object) -> list[Tensor]:
     """
     tensors = [value for value in values.values() if isinstance(value, Tensor)]
     dtypes = {value.dtype for value in tensors}
-    if len(tensors) == len(values) and len(dtypes) == 1 and dtypes.pop().is_floating_point:
+    dense = all(value.layout is torch.strided for value in tensors)
+    if dense and len(tensors) == len(values) and len(dtypes) == 1 and dtypes.pop().is_floating_point:
         return tensors
     try:
         given = [torch.as_tensor(v).dtype if hasattr(v, "dtype") else torch.float64 for v in values.values()]
-        if any(dtype.is_complex for dtype in given):
-            raise TypeError("not complex")
+        if any(dtype.is_complex for dtype in given) or not dense:
+            raise TypeError("real, and not sparse")
         wide = [dtype if dtype.is_floating_point else torch.float64 for dtype in given]
         dtype = functools.reduce(torch.promote_types, wide)
         return [torch.as_tensor(value, dtype=dtype) for value in values.values()]
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         valid = f"numbers, in a tensor, an array or nested lists ({error})"
         raise ParameterError(", ".join(values), tuple(values.values()), valid) from None

@@ -12,7 +12,8 @@ import torch
 
 from .._checks import check_kind
 from ..description import HandDescription
-from ..exceptions import CommandRefusedError, PlantInUseError
+from ..exceptions import CommandRefusedError, ParameterError, PlantInUseError
+from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .observation import Observation
 from .path import Path
@@ -187,9 +188,9 @@ class Gate(PlantWrapper):
         """v in float64, or a refusal."""
         names, kind = self._hand.actuator_names, f"a {type(delta_a).__name__}"
         try:
-            v = torch.as_tensor(delta_a).detach().to("cpu", torch.float64)
+            v = as_tensors(delta_a=delta_a)[0].detach().to("cpu", torch.float64)
             kind = f"{tuple(v.shape)} numbers"
-        except (TypeError, ValueError, RuntimeError):
+        except ParameterError:
             v = torch.empty(0)
         if v.shape != (len(names),):
             self._refuse("the hand", by, kind, f"{len(names)} numbers [rad]: {', '.join(names)}")

@@ -56,13 +56,17 @@ def _numbers(name: str, value: Any, shape: tuple[int, ...], hand: HandDescriptio
     name = f"Observation.{name}"
     check_kind(name, value, torch.Tensor, "a torch tensor")
     check_shape(name, value, shape, f"the hand is '{hand.name}'")
-    if value.is_complex() or value.dtype is torch.bool:
-        raise ParameterError(name, value, "real numbers")
+    _check_real(name, value)
     if value.requires_grad:
         raise ParameterError(name, value, "free of gradients: detach() it")
     value = value.to("cpu", torch.float64)
     check_finite(name, value)
     return value
+
+
+def _check_real(name: str, value: Tensor) -> None:
+    if value.is_complex() or value.dtype is torch.bool or value.layout is not torch.strided:
+        raise ParameterError(name, value, "real numbers in a dense tensor")
 
 
 def _clock(name: str, value: Any) -> float:
@@ -87,9 +91,11 @@ def _info(info: Any) -> dict[str, Any]:
         return info
     name = "Observation.info['estimate']['pose_covariance']"
     try:
-        covariance = torch.as_tensor(stated).detach().to("cpu", torch.float64)
+        covariance = torch.as_tensor(stated)
     except (TypeError, ValueError, RuntimeError):
         raise ParameterError(name, stated, "a tensor (6, 6)") from None
+    _check_real(name, covariance)
+    covariance = covariance.detach().to("cpu", torch.float64)
     check_shape(name, covariance, (6, 6), "of the error twist (v; w) [m, rad]")
     if not bool(covariance.isnan().any()):
         check_finite(name, covariance)

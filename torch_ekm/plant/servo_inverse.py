@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import torch
 
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_kind, check_shape
 from ..description import HandDescription
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
@@ -51,11 +51,6 @@ class ServoInverse(PlantWrapper):
         """v of the last motion [rad]; of a path, its last waypoint."""
         self._told = torch.ones(len(self.servo.names), dtype=torch.bool)  # motors that it tells something of
 
-    @property
-    def stuck(self) -> tuple[str, ...]:
-        """Actuators that do not move however they are commanded."""
-        return tuple(n for n, s in zip(self.servo.names, self.servo.stuck.tolist(), strict=True) if s)
-
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the encoders by ``delta_a`` [rad], wait, read the sensors, learn of the servos.
 
@@ -98,13 +93,14 @@ class ServoInverse(PlantWrapper):
         Of a motor that turns round on the way, and of a path that ``watch`` ends, :meth:`learn` learns
         nothing: what a dead zone took of them is not seen at the end.
         """
-        check_shape("waypoints", path.waypoints[0], (len(self.servo.names),), "for each waypoint")
-        v, last = self._inverse(path.waypoints, start)
+        waypoints = check_kind("path", path, Path).waypoints
+        check_shape("waypoints", waypoints[0], (len(self.servo.names),), "for each waypoint")
+        v, last = self._inverse(waypoints, start)
         if not bool(v.isfinite().all()):
             self.gate.command(v[~v.isfinite().all(1)][0], start, by)  # refuses, and says why
         seconds = v.diff(dim=0, prepend=torch.zeros_like(v[:1])).abs().amax(1) / self.gate.speed
         sent = Path(v, torch.maximum(path.durations, seconds).cumsum(0))
-        onward = last * path.waypoints[-1] > self.servo.resolution  # else it ends on its way back
+        onward = last * waypoints[-1] > self.servo.resolution  # else it ends on its way back
         self._start, self.sent, self._told = start.a, v[-1], onward | (last == 0)
 
         def look(seen: Observation) -> bool:

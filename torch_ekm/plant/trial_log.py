@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from .._files import WriterLock, make_folder, told_as_damage, told_as_output_error, write_whole
+from .._files import WriterLock, make_folder, told_as_damage, told_as_output_error
 from .._versions import versions_of
 from .._warnings import warn
-from ..exceptions import DescriptionError, OutputError, ParameterError, StateError
+from ..exceptions import DescriptionError, ParameterError, StateError
 from .trajectory import Trajectory, plain
 from .trial_file import read_trial
 
-INDEX = "index.csv"
 DAMAGED = ".damaged"
 _NAME = re.compile(r"trial_(\d{6,})\.h5")
 _PACKAGES = ("torch_ekm", "torch", "numpy", "sapien", "opencv-python")
@@ -26,7 +23,7 @@ _TOLD = ("commands", "time", "status")  # arrays that an entry is made of
 
 
 class TrialEntry(NamedTuple):
-    """One trial, as a line of the index: its number, seed, length and end."""
+    """One trial in a line: its number, seed, length and end."""
 
     trial: int
     seed: int
@@ -41,13 +38,13 @@ class TrialEntry(NamedTuple):
 
 
 class TrialLog:
-    """One HDF5 file for each trial, ``trial_000012.h5``, and ``index.csv``.
+    """One HDF5 file for each trial, ``trial_000012.h5``.
 
     A trial's file appears whole or not at all, so a run that is killed loses the current trial and
     nothing else; started again it asks for :meth:`missing` trials and ends with the same bytes as a run
     that was never stopped, if a trial depends on its configuration and seeds alone. Each file has a digest
     of all its bytes; one that is damaged gives a warning, is renamed to ``trial_000012.h5.damaged``, and
-    missing. The index is made again from the files.
+    missing.
 
     One writer at a time: a log is locked until :meth:`close`, the end of a ``with``, or of its process.
 
@@ -74,7 +71,6 @@ class TrialLog:
             self._index, self.damaged = _entries(self.folder, self.configuration)
             with told_as_output_error(self.folder):
                 self._clear_up()
-            self._write_index()
         except BaseException:
             self.close()
             raise
@@ -146,8 +142,7 @@ class TrialLog:
         Raises:
             ParameterError: there is such a trial already, or ``outcome`` is nothing that JSON can hold.
             StateError: the log was opened to be read, or is closed.
-            OutputError: the trial cannot be written, and the log is what it was; or the index cannot: the
-                trial is then kept, and the next run writes the index.
+            OutputError: the trial cannot be written, and the log is what it was.
         """
         if self._lock is None:
             raise StateError(
@@ -165,7 +160,6 @@ class TrialLog:
         kept = dataclasses.replace(trajectory, about=plain(about))
         path = kept.save(self.path(trial))
         self._index[trial] = _entry(trial, *read_trial(path, _TOLD.__contains__))
-        self._write_index()
         return path
 
     def close(self) -> None:
@@ -188,15 +182,8 @@ class TrialLog:
             what = f"{problem}; kept as {aside.name}, and missing from the log"
             warn(f"{aside.with_suffix('')}: {what}")
         for path in self.folder.glob("*.part"):
-            if path.stem == INDEX or _NAME.fullmatch(path.stem):
+            if _NAME.fullmatch(path.stem):
                 path.unlink()
-
-    def _write_index(self) -> None:
-        path, right = self.folder / INDEX, index_lines(self._index)
-        if path.exists() and not path.is_file():
-            raise OutputError(path, "it is no file but a folder or a device: move it away")
-        if not path.exists() or path.read_bytes() != right:
-            write_whole(path, right)
 
 
 def trial_path(folder: Path, trial: int) -> Path:
@@ -211,7 +198,7 @@ def trials_in(folder: Path) -> tuple[int, ...]:
 
 
 def read_entry(folder: Path, trial: int) -> tuple[TrialEntry, dict[str, Any]]:
-    """A trial's line of the index and its configuration, from its file.
+    """A trial in a line, and its configuration, from its file.
 
     Raises:
         DescriptionError: the file is damaged, or holds another trial.
@@ -223,14 +210,6 @@ def read_entry(folder: Path, trial: int) -> tuple[TrialEntry, dict[str, Any]]:
     configuration = about.get("configuration", {})
     with told_as_damage(path, "trial"):
         return _entry(trial, seed, about, arrays), dict(configuration)
-
-
-def index_lines(entries: Mapping[int, TrialEntry]) -> bytes:
-    """Bytes of ``index.csv``: a header and a line for each trial, in order."""
-    text = io.StringIO()
-    rows = (TrialEntry._fields, *(entries[trial] for trial in sorted(entries)))
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue().encode(errors="backslashreplace")  # JSON holds texts that UTF-8 does not
 
 
 def check_configuration(there: Mapping[str, Any], wanted: Mapping[str, Any], place: object) -> None:

@@ -6,22 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from .._files import read_file
 from ..description.registry import file_digests
-from ..exceptions import DescriptionError, EKMError, StateError
+from ..exceptions import EKMError, StateError
 from .trajectory import Trajectory
-from .trial_log import (
-    DAMAGED,
-    INDEX,
-    TrialEntry,
-    check_configuration,
-    index_lines,
-    read_entry,
-    trial_path,
-    trials_in,
-)
-
-_LARGEST_INDEX = 64 << 20  # bytes
+from .trial_log import DAMAGED, check_configuration, read_entry, trial_path, trials_in
 
 
 class Finding(NamedTuple):
@@ -34,7 +22,7 @@ class Finding(NamedTuple):
 
 
 def verify_log(folder: str | Path) -> list[Finding]:
-    """Check every byte of a log: each trial, the index, and the hand's and object's files it was made from.
+    """Check every byte of a log: each trial, and the hand's and object's files that it was made from.
 
     A trial is right if its SHA-256 is, it can be read, it is the one that its name says, and its
     configuration is that of the others. The digests detect damage, not deliberate changes of a file
@@ -48,7 +36,6 @@ def verify_log(folder: str | Path) -> list[Finding]:
     if not trials:
         problem = "no log: there is no file named trial_000000.h5 or the like in it"
         return [Finding(str(folder), "wrong", problem)]
-    entries: dict[int, TrialEntry] = {}
     shared: dict[str, Any] | None = None
     found = []
     for trial in trials:
@@ -61,30 +48,14 @@ def verify_log(folder: str | Path) -> list[Finding]:
             if len(recording.observations) not in (len(recording.commands) + 1, 0):
                 sizes = f"{len(recording.commands)} commands and {len(recording.observations)} observations"
                 raise StateError(f"{sizes}; there must be one observation more than commands")
-            entries[trial] = entry
             what = f"{entry.commands} commands, {entry.reason or entry.status}"
             found.append(Finding(path.name, "ok", what))
         except EKMError as error:
             found.append(Finding(path.name, "wrong", str(error).removeprefix(f"{path}: ")))
-    found += [_index(folder, entries, len(trials)), *_sources(shared or {})]
+    found += _sources(shared or {})
     left_over = sorted([*folder.glob("*.part"), *folder.glob(f"*{DAMAGED}")])
     what = "no part of the log; the next run clears up unfinished files"
     return found + [Finding(path.name, "left over", what) for path in left_over]
-
-
-def _index(folder: Path, entries: Mapping[int, TrialEntry], n_trials: int) -> Finding:
-    try:
-        written = read_file(folder / INDEX, "index", _LARGEST_INDEX)
-    except DescriptionError:
-        return Finding(INDEX, "wrong", "missing; the next run makes it from the files")
-    right = index_lines(entries)
-    if written == right:
-        return Finding(INDEX, "ok", f"lists {len(entries)} trials")
-    listed = {line.partition(b",")[0] for line in written.splitlines()[1:]}
-    complete = len(listed) == n_trials and {*right.splitlines()} <= {*written.splitlines()}
-    if complete and len(entries) < n_trials:
-        return Finding(INDEX, "ok", f"lists {n_trials} trials, the damaged ones too")
-    return Finding(INDEX, "wrong", "disagrees with the files; the next run makes it from them")
 
 
 def _sources(configuration: Mapping[str, Any]) -> list[Finding]:

@@ -99,6 +99,11 @@ class MotionTests:
         rows, _ = self.hand.pad_rows(lin.contacts.finger)
         return len(rows) < len(lin.contacts.finger) or bool(lin.held_joints.any())
 
+    @property
+    def agreed(self) -> bool:
+        """Joints, pads and object did, before the first motion."""
+        return self._begun is not None and self.on_surface(self._begun)
+
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state."""
         said = self._offset(seen), self._differs(seen), self._off_surface(seen)

@@ -200,6 +200,14 @@ class Watch:
         way, turn = (float(torch.linalg.vector_norm(part)) for part in ds.split(3))
         return f"the object has slid {1e3 * way:.1f} mm and {deg(turn)} farther than predicted"
 
+    def suspects(self, seen: Observation) -> str:
+        """Which sensors contradict each other where the model refuses a state; nothing is learned of the
+        manipulation if the joints and the object agreed at first."""
+        said = self.motions.suspects(seen)
+        if said and self.motions.agreed:
+            self.lie = said
+        return said
+
     def rest(self, before: Observation, seen: Observation) -> Observation:
         """A further reading of a hand at rest, or ``before`` where it cannot be one."""
         if seen.status is PlantStatus.LOST:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,7 +25,9 @@ _READERS = {
 }  # fmt: skip
 _MOST_COLUMNS = 4096
 _INDEXED = re.compile(r"(.+)\[([0-9]{1,4})\]")
-_TIME = re.compile(r"(time|timestamp|stamp)([ _]?[\[(]?(s|ms|us|ns|sec|seconds)[\])]?)?", re.IGNORECASE)
+_TIME = re.compile(  # also %time of ROS 1, __time of PlotJuggler, header.stamp
+    r"(.*[./])?[%_]*(time|timestamp|stamp)([ _]?[\[(]?(s|ms|us|ns|sec|seconds)[\])]?)?", re.IGNORECASE
+)
 
 
 class Rows(NamedTuple):
@@ -58,14 +61,14 @@ def open_table(
         UnknownNameError: the recording has no such topic; the message lists them.
     """
     kind = path.suffix.lower()
-    if kind not in _READERS and (path.is_dir() or kind in _BAGS):
+    if kind not in _READERS and (os.path.isdir(path) or kind in _BAGS):
         if clock is None:
             raise ParameterError(
                 "clock", clock, "a topic whose messages set the rows, such as that of the commands"
             )
         bag = interop.read_bag(path, clock)
         return bag.names, partial(_bag_rows, path, bag)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise DescriptionError(path, "there is no such file")
     if kind not in _READERS:
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
