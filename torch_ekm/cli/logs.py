@@ -114,7 +114,7 @@ def _show(shown: View, page: Path) -> None:
     from ..rendering import save_animation
 
     if shown.rows:
-        print_table(shown.header, shown.rows, shown.title)
+        print_table(shown.header, shown.rows, shown.told.title)
     for note in shown.notes:
         say(f"Not drawn: {note}")
-    say(f"Page:      {save_animation(shown.scene, page).resolve()}")
+    say(f"Page:      {save_animation(shown.scene, page, shown.told).resolve()}")
