@@ -105,7 +105,8 @@ def _shape(scene: Scene, i: int, shape: Any, colour: Colour) -> dict[str, Any]:
 def _curve(told: Told) -> dict[str, Any] | None:
     if told.turned is None:
         return None
-    curve: dict[str, Any] = {"label": "turned [deg]", "values": told.turned.tolist(), "target": told.target}
+    target = None if told.target is None else float(told.target)
+    curve: dict[str, Any] = {"label": "turned [deg]", "values": told.turned.tolist(), "target": target}
     if told.std is not None:
         curve["low"] = (told.turned - 2 * told.std).tolist()
         curve["high"] = (told.turned + 2 * told.std).tolist()
