@@ -42,13 +42,13 @@ const found = {}, wait = ms => new Promise(done => setTimeout(done, ms));
     const texts = cut.map(one => one.textContent.slice(0, 60));
     found[page] = {wide: inside.documentElement.scrollWidth, cut: texts};
     if (view.viewer) {
-      const first = view.viewer.frame; await wait(1500);
+      const shown = new Set();  // a loaded machine draws a frame in a second
+      for (let k = 0; k < 600 && shown.size < 3; k++) { shown.add(view.viewer.frame); await wait(50); }
       const gl = inside.getElementById("gl"), copy = document.createElement("canvas");
       copy.width = gl.width; copy.height = gl.height; view.viewer.redraw();
       const pen = copy.getContext("2d"); pen.drawImage(gl, 0, 0);
       const colours = new Set(new Uint32Array(pen.getImageData(0, 0, gl.width, gl.height).data.buffer));
-      const moved = view.viewer.frame - first;
-      found[page].viewer = {failed: view.viewer.failed, moved, colours: colours.size};
+      found[page].viewer = {failed: view.viewer.failed, frames: shown.size, colours: colours.size};
     }
     frame.remove();
   }
@@ -124,6 +124,6 @@ def test_viewers_draw_and_play(look: Any) -> None:
     found, errors = look(tuple(f"_static/viewer/{name}.html" for name in VIEWERS), 800)
     for page, one in found.items():
         assert one["viewer"]["failed"] == "", page
-        assert one["viewer"]["moved"] > 0.5, page
+        assert one["viewer"]["frames"] == 3, page
         assert one["viewer"]["colours"] > 50, page
     assert not errors
