@@ -23,7 +23,7 @@ def run(mark: str) -> tuple[str, dict[str, Any]]:
 
 def test_an_enhanced_model_around_a_model_of_ones_own() -> None:
     torch.manual_seed(0)
-    _, names = run("def f(state, action)")
+    _, names = run("default_learner(4, 2)")
     ekm, f = names["ekm"], names["f"]
     state, action = torch.rand(100, 2), torch.randn(100, 2)
     model = torch.stack([f(s, a) for s, a in zip(state, action, strict=True)])

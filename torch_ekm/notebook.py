@@ -6,7 +6,6 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .experiments.learner_comparison.plots import plot_cost as plot_cost
 from .experiments.learner_comparison.plots import plot_learning_curves as plot_learning_curves
 from .experiments.learner_comparison.plots import plot_scores as plot_scores
 from .experiments.learner_comparison.recordings import load_recording as load_recording
@@ -29,7 +28,6 @@ __all__ = [
     "load_recording",
     "load_table",
     "overview_table",
-    "plot_cost",
     "plot_learning_curves",
     "plot_scores",
     "score_table",
