@@ -159,7 +159,7 @@ def compare(
     print_report(compared.write(out), out, notes=True)
     best = dict.fromkeys(compared.best(stream.name).learner for stream in compared.streams)
     say(f"Best:      {', '.join(best)}")
-    say_next('how the best one is made: how_to/choose_a_learner, "Names in torch-ekm compare"')
+    say_next("EnhancedModel(f, learner) in your loop; the call of each name: docs/how_to/choose_a_learner.md")
 
 
 def _left_out(planned: Experiment) -> str:
