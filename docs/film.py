@@ -22,7 +22,8 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.inspection.view import view
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantWrapper
-from torch_ekm.rendering import Picture, Scene, Told, make_scene, pad_forces, save_animation
+from torch_ekm.rendering import Picture, Scene, Told, make_scene, save_animation
+from torch_ekm.rendering.web import pad_forces
 from torch_ekm.simulation import SimulatedHand
 from torch_ekm.typing import Array
 

@@ -19,8 +19,9 @@ from ..kinematics import ActuationMap, GraspState
 from ..kinematics.se3 import log as rotation_vector
 from ..model import KinematicModel
 from ..plant import Observation, PlantStatus, Trajectory, TrialLog
-from ..rendering import Scene, Told, make_scene, pad_forces
+from ..rendering import Scene, Told, make_scene
 from ..rendering.visuals import visuals
+from ..rendering.web import pad_forces
 from ..simulation import SimulatedHand
 from ..typing import Array, Tensor
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from .image import Picture, save_picture
 from .scene import Scene, make_scene
-from .web import Told, pad_forces, save_animation
+from .web import Told, save_animation
 
 __all__ = [
     "Picture",
     "Scene",
     "Told",
     "make_scene",
-    "pad_forces",
     "save_animation",
     "save_picture",
 ]
