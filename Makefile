@@ -8,7 +8,7 @@ export OMP_NUM_THREADS ?= 1
 # compiled once, and read by the many processes of the tests
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo test test-fast coverage docs notebooks notebooks-smoke lint types imports check release install install-locked lock clean
+.PHONY: demo test test-fast coverage docs docs-only notebooks notebooks-smoke lint types imports check release install install-locked lock clean
 
 install: $(VENV)/installed
 
@@ -55,11 +55,15 @@ test-fast: install
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile $(addprefix tests/,$(FAST)) \
 		--ignore=tests/description/test_description_hostile.py --ignore=tests/description/test_description_docs.py
 
+# a first look at changed pages: what has changed is built again, warnings stay warnings
+docs-only: install
+	$(BIN)/python -m sphinx -n docs docs/_build/html
+
 # the site, docs/_build/html/index.html; a warning is an error, and so is a link that leads nowhere
 docs: install
 	rm -rf docs/_build/html docs/reference/api/generated
 	$(BIN)/python -m sphinx -E -W -n --keep-going docs docs/_build/html
-	TORCH_EKM_SITE=docs/_build/html $(BIN)/python -m pytest -q tests/docs/test_docs_site.py
+	TORCH_EKM_SITE=docs/_build/html $(BIN)/python -m pytest -q tests/docs/test_docs_site.py tests/docs/test_docs_browser.py
 
 # executed in place, outputs stored; 04 reads recordings in TORCH_EKM_DATA, 05 finished runs in TORCH_EKM_REPORTS
 NBCONVERT := $(BIN)/jupyter nbconvert --to notebook --inplace
@@ -69,7 +73,8 @@ notebooks: install
 	$(NBCONVERT) --coalesce-streams $(wildcard notebooks/*.ipynb)
 
 notebooks-smoke: install
-	TORCH_EKM_SMOKE=1 $(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 notebooks
+	$(BIN)/python tests/notebooks/smoke.py build/notebooks
+	TORCH_EKM_SMOKE=1 $(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 build/notebooks
 
 lint: install
 	$(BIN)/ruff check .

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import os
 import shutil
 import sys
@@ -63,6 +65,10 @@ shutil.rmtree(NOTEBOOKS, ignore_errors=True)
 NOTEBOOKS.mkdir(parents=True)
 for notebook in sorted((ROOT / "notebooks").glob("[0-9]*.ipynb")):
     shutil.copy2(notebook, NOTEBOOKS)
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    outputs = [one.get("data", {}) for cell in cells for one in cell.get("outputs", ())]
+    shown = (data["image/png"] for data in outputs if "image/png" in data)
+    (NOTEBOOKS / f"{notebook.stem}.png").write_bytes(base64.b64decode(next(shown)))  # for the gallery
 
 # one generated page for each public package
 autosummary_generate = True

@@ -76,7 +76,7 @@ def grasp_by_hand() -> Figure:
 
 
 def loop() -> Figure:
-    """What goes round in one motion of the E-KM."""
+    """What goes round in one movement of the E-KM."""
     figure, ax = _bare(7.2, 2.9)
 
     def box(x: float, y: float, text: str, color: str, width: float = 1.7) -> None:
@@ -86,14 +86,14 @@ def loop() -> Figure:
         ax.add_patch(patch)
         ax.text(x, y, text, ha="center", va="center", color=color)
 
-    box(1.0, 2.2, "pose error\nlimited", INK, 1.5)
-    box(3.3, 2.2, "QP on $f + g$\ntasks, limits", BLUE)
+    box(1.0, 2.2, "look:\nreached?", INK, 1.5)
+    box(3.3, 2.2, "plan on $f + g$\npieces, bands", BLUE)
     box(5.6, 2.2, "servo inverse", BLUE)
     box(7.9, 2.2, "hand, object", ORANGE)
     box(7.9, 0.6, "sensors,\nguards", INK)
     box(5.6, 0.6, "dead zone,\nbias", GREEN)
-    box(3.3, 0.6, "learner $g$,\npace", GREEN)
-    for x, text in ((2.1, r"$\delta x_d$"), (4.45, "$w$"), (6.75, "$v$")):
+    box(3.3, 0.6, "learner $g$,\nhand figures", GREEN)
+    for x, text in ((2.1, "$e$"), (4.45, "$w$"), (6.75, "$v$")):
         _arrow(ax, (x - 0.24, 2.2), (x + 0.24, 2.2))
         ax.text(x, 2.36, text, ha="center")
     _arrow(ax, (7.9, 1.84), (7.9, 0.96))
@@ -102,7 +102,7 @@ def loop() -> Figure:
     _arrow(ax, (5.6, 0.96), (5.6, 1.84), GREEN)
     ax.plot([7.9, 7.9, 3.3], [0.24, 0.0, 0.0], color=GREEN, lw=1.5)
     _arrow(ax, (3.3, 0.0), (3.3, 0.26), GREEN)
-    ax.text(5.6, -0.22, r"$y = \delta s - J_m w$", ha="center", color=GREEN)
+    ax.text(5.6, -0.22, r"$y = \delta s - f(s, w)$", ha="center", color=GREEN)
     _arrow(ax, (3.3, 0.96), (3.3, 1.84), GREEN)
     ax.plot([8.79, 9.2, 9.2, 1.0], [0.6, 0.6, 2.9, 2.9], color=INK, lw=1.5)
     _arrow(ax, (1.0, 2.9), (1.0, 2.56))

@@ -110,7 +110,7 @@ def test_front_door_and_rooms_need_torch_and_numpy_only() -> None:
 
 
 _PLOTS = ("matplotlib", "scipy", "jinja2", "typer", "rich")
-_HEAVY = {"sapien", "vtk", "pyvista", "h5py", "viser", "qpsolvers", "trimesh", "cv2"}
+_HEAVY = {"sapien", "vtk", "pyvista", "h5py", "qpsolvers", "trimesh", "cv2"}
 _COMMANDS = f"""
 import sys
 from torch_ekm.cli import main

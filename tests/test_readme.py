@@ -23,7 +23,7 @@ def run(mark: str) -> tuple[str, dict[str, Any]]:
 
 def test_an_enhanced_model_around_a_model_of_ones_own() -> None:
     torch.manual_seed(0)
-    _, names = run("def f(state, action)")
+    _, names = run("default_learner(4, 2)")
     ekm, f = names["ekm"], names["f"]
     state, action = torch.rand(100, 2), torch.randn(100, 2)
     model = torch.stack([f(s, a) for s, a in zip(state, action, strict=True)])
@@ -45,3 +45,11 @@ def test_the_e_km_turns_the_box_in_at_most_twenty_lines(capsys) -> None:
     true = result.stop.final.truth  # and not only as the noisy sensors saw it
     turned = type(start.state)(true.q, true.position, true.rotation).minus(start.state)[-3:]
     assert abs(math.degrees(turned @ names["plant"].rotation_axis) - 20) < 1.0
+
+
+def test_it_is_short() -> None:
+    """One page: at most 80 lines of 120 characters, and 700 words."""
+    text = README.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 80
+    assert len(text.split()) <= 700
+    assert max(map(len, text.splitlines())) <= 120

@@ -11,7 +11,7 @@ _BRINGS = {
     "robot": ("pytorch_kinematics", "yourdfpy", "trimesh", "coal", "qpsolvers", "clarabel", "scipy"),
     "sim": ("sapien", "cv2", "gymnasium", "h5py", "filelock"),
     "plots": ("matplotlib", "jinja2", "typer", "rich"),
-    "experiments": ("joblib", "pandas", "pyvista", "viser"),
+    "experiments": ("joblib", "pandas", "pyvista"),
     "notebooks": ("IPython", "pyarrow"),
     "peers": ("river",),
     "fast": ("numba",),

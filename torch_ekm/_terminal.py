@@ -57,6 +57,11 @@ def say(text: object) -> None:
     console.print(as_printed(text), soft_wrap=True, highlight=False)
 
 
+def say_next(text: object) -> None:
+    """What to do after a command."""
+    say(f"Next:      {text}")
+
+
 def say_error(text: object) -> None:
     """Print a line on the error stream, headed by the program's name."""
     line = Text.assemble(("torch-ekm:", "bold red"), " ", as_printed(text))
@@ -65,13 +70,22 @@ def say_error(text: object) -> None:
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
-    """What, a bar, how many of how many, for how long, how long still; gives what is called after each."""
+    """What, a bar, how many of how many, for how long, how long still; gives what is called after each.
+
+    Ctrl-C ends it; what is finished is kept by who runs it.
+    """
+    say("Ctrl-C stops; the same command then goes on from there.")
     name = TextColumn("{task.description}", markup=False)
     left = TextColumn("left:"), TimeRemainingColumn()
     columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), *left)
     with Progress(*columns, console=console) as bars:
         task = bars.add_task(as_printed(what), total=total)
-        yield lambda _: bars.advance(task)
+        try:
+            yield lambda _: bars.advance(task)
+        except KeyboardInterrupt:
+            bars.stop()
+            say("Stopped. The same command goes on from here.")
+            raise
 
 
 def unbroken(text: str, width: int) -> str:
@@ -85,6 +99,8 @@ def print_report(report: Report, folder: Path, notes: bool = False) -> None:
     say(unbroken(as_printed(report.summary), console.width))
     for table in report.tables[:1]:
         print_table(table.header, table.text(), table.caption, table.note if notes else None)
+    if report.figures:
+        say(f"Figures:   {', '.join(figure.path for figure in report.figures)}")
     say(f"Report:    {(folder / 'index.html').resolve()}")
 
 

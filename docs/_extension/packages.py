@@ -17,6 +17,7 @@ import torch_ekm
 
 _ALSO = [
     "torch_ekm.testing",
+    "torch_ekm.notebook",
     "torch_ekm.exceptions",
     "torch_ekm.typing",
 ]  # public modules that are no packages

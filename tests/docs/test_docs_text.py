@@ -10,6 +10,7 @@ import pytest
 from torch_ekm.description import transmission
 
 DOCS = Path(__file__).parents[2] / "docs"
+PACKAGE = DOCS.parent / "torch_ekm"
 
 
 @pytest.fixture(autouse=True)
@@ -37,3 +38,24 @@ def test_tables_fit_on_a_page() -> None:
         if rule.count("|") > 9
     }
     assert not wide
+
+
+def test_the_walks_through_the_code_name_what_is_there() -> None:
+    """Each file of architecture.md exists, and holds the names that stand in brackets behind it."""
+    page = (DOCS / "development" / "architecture.md").read_text(encoding="utf-8")
+    walks, wrong = page.partition("## Packages")[0], []
+    found = re.findall(r"`([a-z_/]+\.py)`(?: \(`(\w+)`\))?", walks)
+    assert len(found) > 30
+    for path, name in found:
+        file = next((one / path for one in (PACKAGE, PACKAGE.parent) if (one / path).is_file()), None)
+        if file is None or name not in file.read_text(encoding="utf-8"):
+            wrong.append(f"{path} ({name})")
+    assert not wrong
+
+
+def test_the_glossary_is_short() -> None:
+    """At most sixty terms, in their order."""
+    page = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
+    terms = re.findall(r"^([^\s`#{][^\n]*)\n  \S", page, re.MULTILINE)
+    assert 20 < len(terms) <= 60
+    assert terms == sorted(terms, key=str.lower)

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from torch_ekm._terminal import as_printed, print_report, print_table, unbroken
 from torch_ekm.cli import app, main
+from torch_ekm.cli._help import GROUPS
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 from torch_ekm.experiments.reporting.report import unbroken as unbroken_html
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan
@@ -166,3 +167,26 @@ def test_a_page_begins_with_the_answer_and_folds_the_rest(tmp_path: Path) -> Non
     places = [page.index(part) for part in order]
     assert places == sorted(places)
     assert '<span class="figure">0.1 [0.0, 0.2] deg</span>' in page
+
+
+def test_every_command_stands_in_a_group_with_a_whole_sentence() -> None:
+    assert sorted(name for names in GROUPS.values() for name in names) == sorted(
+        typer.main.get_command(app).commands
+    )
+    told = CliRunner().invoke(app, ["--help"]).output
+    assert all(title in told for title in GROUPS)
+    assert (
+        "Find dead zone, bias and play of each motor of a real hand, by motions of 0.4 to 2 deg."
+        in " ".join(told.split())
+    )
+    assert "..." not in told.replace("[ARGS]...", "")
+
+
+def test_columns_that_look_like_measured_and_predicted_are_proposed(tmp_path: Path) -> None:
+    table = tmp_path / "log.csv"
+    table.write_text("angle,torque,model_torque\n" + "0.1,1.0,0.9\n" * 50)
+    done = CliRunner().invoke(app, ["compare", "--data", str(table), "--jobs", "1"])
+    assert "--measured torque --predicted model_torque" in str(done.exception)
+    table.write_text("angle,torque\n" + "0.1,1.0\n" * 50)
+    done = CliRunner().invoke(app, ["compare", "--data", str(table), "--jobs", "1"])
+    assert "--measured torque" not in str(done.exception)

@@ -11,6 +11,7 @@ from .._terminal import say  # first: needs the extra
 from .._text import figure
 from .._versions import versions_of
 from ..exceptions import MissingExtraError, ParameterError
+from ._help import Commands
 
 import typer  # isort: skip
 from typer import Option  # isort: skip
@@ -19,8 +20,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 app = typer.Typer(
+    cls=Commands,
     help="Kinematic models of underactuated hands, corrected by online learners.",
-    add_completion=False,
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # rich would take "[deg]" for a style and drop it
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from .._terminal import console, print_table, say
+from .._terminal import console, print_table, say, say_next
 from ..exceptions import OutputError, ParameterError
 from ._app import AN_OBJECT, app, needs
 
@@ -43,11 +43,12 @@ def hands(
             if line.startswith(ASSUMED):
                 say(f"Assumed:   {line.removeprefix(ASSUMED)}")
         say(f"Written:   {written.resolve()}")
-        say(f"Next:      put a figure wherever TODO stands, then: torch-ekm check {new}")
+        say_next(f"put a figure wherever TODO stands, then: torch-ekm check {new}")
         return
     found = [load_hand(name) for name in list_hands()]
     rows = [(hand.name, hand.n_q, hand.n_a, len(hand.pads), hand.urdf_path.name) for hand in found]
     print_table(("hand", "joints", "actuators", "contact pads", "URDF"), rows)
+    say_next("torch-ekm show icub_right; one of your own: torch-ekm hands --new my.urdf")
 
 
 @app.command()
@@ -63,6 +64,7 @@ def objects() -> None:
         figures = f"{1e3 * obj.mass:.0f}", f"{obj.friction:g}", f"{1e3 * obj.grasp_width:.0f}"
         rows.append((name, *figures, ", ".join(shape.kind for shape in obj.shapes)))
     print_table(("object", "mass [g]", "friction [1]", "grasp width [mm]", "shapes"), rows)
+    say_next("torch-ekm show icub_right --object can")
 
 
 @app.command()
@@ -119,7 +121,13 @@ def check(
         if shape:
             say(f"{row.name}: {where}:\n{shape[2:]}{rest}")
     if any(row.state == "error" for row in rows):
+        say_next("mend the first error; then the same command again")
         raise typer.Exit(1)
+    say_next(
+        f"torch-ekm show {hand} --object {object} --reach"
+        if plant is None
+        else f"torch-ekm identify-servo --plant {plant}"
+    )
 
 
 @app.command()
@@ -133,6 +141,7 @@ def notebooks(
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
         say(str(path))
+    say_next("torch-ekm notebooks --copy DIR" if copy is None else f"jupyter lab {copy}")
 
 
 @app.command()

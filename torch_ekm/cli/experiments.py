@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from .._terminal import print_report, progress, say
+from .._terminal import print_report, progress, say, say_next
 from ..exceptions import ParameterError
 from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, needs, parse_angles, parse_seeds
 
@@ -15,6 +15,9 @@ from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
     from ..experiments.reproduce import Experiment
+
+#: Seconds of a session on one free core, else 20: how long it takes is said before the first has ended.
+_SESSION = {"online": 70}
 
 
 @app.command()
@@ -38,7 +41,10 @@ def demo(
 
     protocol, chosen = Demo(Setting(hand=hand), (object,)), parse_seeds(seeds)
     planned = Experiment(protocol.quick(), chosen[:2], quick) if quick else Experiment(protocol, chosen)
-    _run("manipulating", planned, out, jobs)
+    _run("turning", planned, out, jobs)
+    say_next(
+        f"open the report; another object: torch-ekm demo can --out {out}_can (torch-ekm objects lists them)"
+    )
 
 
 @app.command()
@@ -81,6 +87,7 @@ def reproduce(
     chosen, things = parse_seeds(seeds), objects or None
     planned = plan(experiment, chosen, setting=setting, objects=things, angles_deg=turns, quick=quick)
     _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs)
+    say_next("the whole of it: the same command without --quick" if quick else "open the report")
 
 
 @app.command()
@@ -150,11 +157,27 @@ def compare(
             on_done=advance,
         )
     print_report(compared.write(out), out, notes=True)
+    best = dict.fromkeys(compared.best(stream.name).learner for stream in compared.streams)
+    say(f"Best:      {', '.join(best)}")
+    say_next("EnhancedModel(f, learner) in your loop; the call of each name: docs/how_to/choose_a_learner.md")
+
+
+def _left_out(planned: Experiment) -> str:
+    """What of the whole experiment is not run."""
+    objects = getattr(planned.protocol, "objects", ())
+    every = getattr(type(planned.protocol)(), "objects", ())
+    missing = [name for name in every if name not in objects]
+    seeds = ", ".join(map(str, planned.seeds))
+    return f"Seeds {seeds}; left out: {', '.join([*missing, 'other seeds', 'larger turns'])}."
 
 
 def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> None:
     from ..experiments.reproduce import reproduce as run
 
+    if planned.quick:
+        say(f"A trial run, which claims nothing. {_left_out(planned)}")
+    n, minutes = len(planned.jobs), len(planned.jobs) * _SESSION.get(what, 20) / jobs / 60
+    say(f"{n} sessions, {jobs} at once: some {max(1, round(minutes))} min, less what is finished.")
     with progress(what, len(planned.jobs)) as advance:
         report = run(planned, folder, jobs, advance)
     print_report(report, folder)

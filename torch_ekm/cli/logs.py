@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from .._terminal import print_table, progress, say
+from .._terminal import print_table, progress, say, say_next
 from ._app import AN_OBJECT, Engine, Hand, Page, Preset, Sensing, app, needs, parse_angles, parse_seeds
 
 import typer  # isort: skip
@@ -47,7 +47,9 @@ def record(
     ends = Counter(e.status if e.status == "not grasped" else e.reason or e.status for e in made.index)
     say(f"{made.folder.resolve()}: {', '.join(f'{n} {end}' for end, n in ends.items())}")
     if set(ends) == {"not grasped"}:
+        say_next(f"torch-ekm check {hand} {object} says why no pinch holds")
         raise typer.Exit(1)
+    say_next(f"torch-ekm replay {log}")
 
 
 @app.command()
@@ -106,7 +108,9 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
     found = verify_log(log)
     print_table(Finding._fields, found, str(log))
     if any(one.state == "wrong" for one in found):
+        say_next("torch-ekm record makes trials of a simulated hand again; of a real one use your copy")
         raise typer.Exit(1)
+    say_next(f"torch-ekm health {log}")
 
 
 def _show(shown: View, page: Path) -> None:
@@ -114,7 +118,8 @@ def _show(shown: View, page: Path) -> None:
     from ..rendering import save_animation
 
     if shown.rows:
-        print_table(shown.header, shown.rows, shown.title)
+        print_table(shown.header, shown.rows, shown.told.title)
     for note in shown.notes:
         say(f"Not drawn: {note}")
-    say(f"Page:      {save_animation(shown.scene, page).resolve()}")
+    say(f"Page:      {save_animation(shown.scene, page, shown.told).resolve()}")
+    say_next("open the page in a browser: play, step, drag to look around")

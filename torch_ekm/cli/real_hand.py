@@ -7,7 +7,7 @@ from json import dumps
 from pathlib import Path
 from typing import Annotated
 
-from .._terminal import console, print_table, say
+from .._terminal import console, print_table, say, say_next
 from ..exceptions import ParameterError
 from ._app import app, needs
 
@@ -41,6 +41,9 @@ def slack(
     if write:
         write_zeros(driver.wiring, found)
         say(f"Written:   {plant.resolve()}")
+    say_next(
+        f"torch-ekm check --plant {plant}" if write else "write these zeros: the same command with --write"
+    )
 
 
 @app.command()
@@ -67,7 +70,7 @@ def drivers(
     say(text)
     say(f"Written:   {new.resolve()}")
     check = f"torch-ekm check --plant {new}"
-    say(f"Next:      {check} --emulate, {check} --dry-run, {check}")
+    say_next(f"correct its names, then: {check} --emulate, {check} --dry-run, {check}")
 
 
 @app.command(name="identify-servo")
@@ -91,6 +94,9 @@ def identify_servo(plant: Wired, out: Learned = None) -> None:
         knowledge.servo = found.servo
         knowledge.save(out)
         say(f"Written:   {out.resolve()}")
+        say_next(f"ClosedLoop(..., knowledge=HandKnowledge.load({str(out)!r}))")
+    else:
+        say_next(f"keep it: torch-ekm identify-servo --plant {plant} --out hand.ekm")
 
 
 @app.command()
@@ -130,6 +136,9 @@ def health(
     if knowledge is not None:
         say(HandKnowledge.load(knowledge).figures)
     if found:
+        say_next(
+            "mend or describe what changed; torch-ekm knowledge FILE --reset forgets what was learned of it"
+        )
         raise typer.Exit(1)
     few = "" if sum(motions) > BASELINE else f" An actuator is judged after {BASELINE} motions."
     say(f"No actuator changed in {sum(motions)} motions.{few}")
@@ -169,6 +178,7 @@ def knowledge(
     ]
     print_table([*Belief._fields[:3], "believed", "+-", "described", ""], rows, str(file))
     say(f"{len(found) - len(rows)} figures are as described, or not identified (--json lists them).")
+    say_next(f"torch-ekm knowledge {file} --reset servo forgets a part, after a repair say")
 
 
 def _short(value: float | None) -> str:

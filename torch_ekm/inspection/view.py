@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,10 +19,11 @@ from ..kinematics import ActuationMap, GraspState
 from ..kinematics.se3 import log as rotation_vector
 from ..model import KinematicModel
 from ..plant import Observation, PlantStatus, Trajectory, TrialLog
-from ..rendering import Scene, make_scene
+from ..rendering import Scene, Told, make_scene
 from ..rendering.visuals import visuals
+from ..rendering.web import pad_forces
 from ..simulation import SimulatedHand
-from ..typing import Array
+from ..typing import Array, Tensor
 
 _FRAMES = 10  # of one actuator's way through its range
 _STEP, _STEPS = math.radians(2.5), 2  # an actuator of a grasp is moved so far at once, and so often
@@ -31,9 +33,10 @@ _STEP, _STEPS = math.radians(2.5), 2  # an actuator of a grasp is moved so far a
 class View:
     """What there is to look at."""
 
-    title: str
     scene: Scene
     """Its frames are played one after another."""
+    told: Told
+    """Title, and what the page says of each frame."""
     header: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
     """What there is to read."""
@@ -82,25 +85,42 @@ def view_hand(hand: HandDescription) -> View:
     postures = [start, *(start + way * np.diag(upper - start)[i] for i in range(hand.n_a) for way in ways)]
     q = ActuationMap(hand).joints(torch.from_numpy(np.array(postures))).numpy()
     scene = make_scene(hand, None, q, None, None, np.array(hand.gravity))
-    return View(hand.name, scene, notes=tuple(visuals(hand.urdf).problems))
+    lines = ["at rest"]
+    for k, posture in enumerate(postures[1:]):
+        i = k // len(ways)
+        lines.append(f"motor {hand.actuator_names[i]} at {math.degrees(posture[i]):.0f} deg")
+    return View(scene, Told(hand.name, tuple(lines)), notes=tuple(visuals(hand.urdf).problems))
 
 
 def _grasp(plant: SimulatedHand, seen: Observation) -> View:
     """A pinch, and what each actuator does to it by itself."""
     hand, start, grasp, axis = plant.hand, _truth(seen), plant.snapshot(), plant.rotation_axis
-    states, rows = [start], [("at rest", *_moved(start, start, axis), _forces(hand, seen))]
+    shown, lines = [seen], ["at rest"]
+    rows = [("at rest", *_moved(start, start, axis), _forces(hand, seen))]
     for i, name in enumerate(hand.actuator_names):
         step = torch.zeros(hand.n_a, dtype=torch.float64)
         step[i] = _STEP
         way = [plant.command(step) for _ in range(_STEPS)]
-        there = [_truth(one) for one in way]
-        states += [*there, *reversed(there[:-1]), start]
+        shown += [*way, *reversed(way[:-1]), seen]
+        moved = [math.degrees(_STEP) * k for k in (*range(1, _STEPS + 1), *range(_STEPS - 1, -1, -1))]
+        lines += [f"motor {name} {degrees:+.1f} deg" for degrees in moved]
         lost = ", lost" if way[-1].status is PlantStatus.LOST else ""
-        rows.append((name + lost, *_moved(start, there[-1], axis), _forces(hand, way[-1])))
+        rows.append((name + lost, *_moved(start, _truth(way[-1]), axis), _forces(hand, way[-1])))
         plant.restore(grasp)
-    moved = f"actuator, {_STEPS * math.degrees(_STEP):g} deg"
-    header = (moved, "turned about its axis [deg]", "moved [mm]", "forces [N]")
-    return View(f"{hand.name} holds {plant.object.name}", _scene(plant, states), header, tuple(rows))
+    header = (
+        f"actuator, {_STEPS * math.degrees(_STEP):g} deg",
+        "turned about its axis [deg]",
+        "moved [mm]",
+        "forces [N]",
+    )
+    states = [_truth(one) for one in shown]
+    told = Told(
+        f"{hand.name} holds {plant.object.name}",
+        tuple(lines),
+        _turned(states, axis),
+        forces=_forces_on(hand, states, [one.fingertip_force for one in shown]),
+    )
+    return View(_scene(plant, states), told, header, tuple(rows))
 
 
 def _reach(plant: SimulatedHand) -> View:
@@ -108,11 +128,41 @@ def _reach(plant: SimulatedHand) -> View:
     controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
     loop = ClosedLoop(plant, controller)
     back, forth = (loop.reach(sign=sign) for sign in (-1, 1))
-    one, other = forth.plan.states, back.plan.states
-    states = [*one, *reversed(one[:-1]), *other[1:], *reversed(other[:-1])]
+    there = [_along(reach) for reach in (forth, back)]
+    shown = [*there[0], *reversed(there[0][:-1]), *there[1][1:], *reversed(there[1][:-1])]
+    states = [one.state for one in shown]
+    told = Told(
+        f"{plant.hand.name} turns {plant.object.name}: the plan both ways, with two standard deviations",
+        tuple(one.line for one in shown),
+        _turned(states, plant.rotation_axis),
+        np.array([one.std for one in shown]),
+        forces=_forces_on(plant.hand, states, [one.force for one in shown]),
+    )
     rows = tuple(row for name, end in (("back", back), ("forth", forth)) for row in _way(name, end))
     header = ("direction", "angle [deg]", "off the axis [deg]", "ends by")
-    return View(f"{plant.hand.name} turns {plant.object.name}", _scene(plant, states), header, rows)
+    return View(_scene(plant, states), told, header, rows)
+
+
+class _Waypoint(NamedTuple):
+    """What a page shows of one."""
+
+    state: GraspState
+    line: str
+    std: float
+    """Of the turn [deg]."""
+    force: Tensor | None
+
+
+def _along(reach: Reach) -> list[_Waypoint]:
+    """From the grasp to the last waypoint."""
+    plan, found = reach.plan, [_Waypoint(reach.plan.start, "at rest", 0.0, None)]
+    for k, one in enumerate(plan.waypoints, 1):
+        safe = "" if k <= plan.safe else ", not safe"
+        end = f"; ends by {reach.end}" if k == len(plan.waypoints) else ""
+        std = float((plan.focus.matrix[0].square() * one.band.twist_std.square()).sum().sqrt())
+        line = f"waypoint {k}: {one.band}{safe}{end}"
+        found.append(_Waypoint(one.state, line, math.degrees(std), one.band.force))
+    return found
 
 
 def _way(name: str, reach: Reach) -> Iterator[tuple[str, ...]]:
@@ -161,7 +211,16 @@ def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool 
         raise DescriptionError(log, problem)
     scene = make_scene(hand, obj, *_arrays(states), gravity)
     header = ("time [s]", "object", "turned [deg]", "wrong by [deg]", "commanded [deg]", "events")
-    return View(log.stem, scene, header, tuple(_moments(trajectory, hand)))
+    rows = tuple(_moments(trajectory, hand))
+    target = trajectory.about.get("outcome", {}).get("angle_deg")
+    told = Told(
+        f"{hand.name} holds {obj.name}: {log.stem}",
+        tuple(f"motion {k}, {row[0]} s, {row[1]}: {row[4]}" for k, row in enumerate(rows)),
+        np.array([float(row[2]) for row in rows]),
+        target=abs(target) if isinstance(target, float) else None,
+        forces=_forces_on(hand, states, [seen.fingertip_force for seen in trajectory.observations]),
+    )
+    return View(scene, told, header, rows)
 
 
 def _moments(trajectory: Trajectory, hand: HandDescription) -> list[tuple[str, ...]]:
@@ -188,6 +247,22 @@ def _arrays(states: list[GraspState]) -> tuple[Array, Array, Array]:
     parts = zip(*((s.q.numpy(), s.position.numpy(), s.rotation.numpy()) for s in states), strict=True)
     q, position, rotation = map(np.stack, parts)
     return q, position, rotation
+
+
+def _turned(states: Sequence[GraspState], axis: Tensor) -> Array:
+    """About the axis, from the first one on [deg]."""
+    return np.array([math.degrees(float(one.minus(states[0])[-3:] @ axis)) for one in states])
+
+
+def _forces_on(
+    hand: HandDescription, states: Sequence[GraspState], forces: Sequence[Tensor | None]
+) -> Array | None:
+    """Those that are known, at their pads."""
+    if all(force is None for force in forces):
+        return None
+    unknown = np.full(len(hand.pads), np.nan)
+    sizes = [unknown if force is None else force.numpy() for force in forces]
+    return pad_forces(hand, np.stack([state.q.numpy() for state in states]), np.stack(sizes))
 
 
 def _truth(seen: Observation) -> GraspState:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from .image import Picture, save_picture
 from .scene import Scene, make_scene
-from .web import save_animation
+from .web import Told, save_animation
 
 __all__ = [
     "Picture",
     "Scene",
+    "Told",
     "make_scene",
     "save_animation",
     "save_picture",

@@ -1,66 +1,118 @@
-"""A scene in the browser: a stand-alone page (viser)."""
+"""A scene in the browser: one page that needs no network and no library."""
 
 from __future__ import annotations
 
-import contextlib
-import io
+import base64
+import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from .._extras import require
 from .._files import write_whole
+from ..description import HandDescription
+from ..exceptions import ShapeError
+from ..kinematics import HandKinematics
 from ..typing import Array
-from .scene import Scene, shape_mesh
+from .scene import Colour, Scene
 from .visuals import Mesh
 
+_PAGE = Path(__file__).with_name("page.html")
 
-def save_animation(scene: Scene, path: Path) -> Path:
-    """Write the frames as one stand-alone HTML page that can be turned and zoomed.
 
-    viser draws on a server; it listens on 127.0.0.1, at a port of its own, while the page is made.
+@dataclass(frozen=True)
+class Told:
+    """What a page says beside the picture: of ``n`` frames."""
+
+    title: str = ""
+    lines: tuple[str, ...] = ()
+    """One for each frame."""
+    turned: Array | None = None
+    """``(n,)`` about the axis [deg]: drawn as a curve."""
+    std: Array | None = None
+    """``(n,)`` of it [deg]: drawn as a band of two standard deviations."""
+    target: float | None = None
+    """Where it is to go [deg]."""
+    forces: Array | None = None
+    """``(n, n_pads, 6)``: where a pad presses [m], and with what force [N], hand frame; NaN: not known."""
+
+
+def save_animation(scene: Scene, path: Path, told: Told | None = None, *, seconds: float = 0.25) -> Path:
+    """Write the frames as one stand-alone HTML page: play, step, turn, zoom. WebGL 2 draws it.
+
+    Args:
+        told: title, and what is known of each frame.
+        seconds: from frame to frame, between which poses are interpolated.
 
     Raises:
-        MissingExtraError: viser is not installed.
+        ShapeError: ``told`` is of another number of frames.
         OutputError: ``path`` cannot be written.
     """
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = require("viser").ViserServer(host="127.0.0.1", port=0, verbose=False)
-        try:
-            serializer = server.get_scene_serializer()
-            nodes = _draw(server, scene)
-            for frame in scene.transforms:
-                _place(server, nodes, frame)
-                serializer.insert_sleep(0.25)  # [s] for each frame
-            page = serializer.as_html()
-        finally:
-            server.stop()
-    write_whole(path, page)
+    told = Told() if told is None else told
+    n = len(scene.transforms)
+    for name in ("lines", "turned", "std", "forces"):
+        value = getattr(told, name)
+        if value is not None and len(value) not in ({0, n} if name == "lines" else {n}):
+            raise ShapeError(name, f"({n}, ...)", (len(value),))
+    eye, focus, up = (part.tolist() for part in scene.camera)
+    data = {
+        "title": told.title,
+        "lines": told.lines,
+        "frames": n,
+        "seconds": seconds,
+        "shapes": [_shape(scene, i, *one) for i, one in enumerate(scene.shapes)],
+        "poses": _packed(scene.transforms[:, :, :3]),
+        "camera": {"eye": eye, "focus": focus, "up": up},
+        "curve": _curve(told),
+        "arrows": None if told.forces is None else _packed(np.nan_to_num(told.forces)),
+    }
+    # of a text that ends the script nothing is left that a browser takes for a tag
+    text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+    write_whole(path, _PAGE.read_text(encoding="utf-8").replace("/*DATA*/", text))
     return path
 
 
-def _draw(server: Any, scene: Scene) -> list[Any]:
-    """Add the scene to a viser server, seen from its side; returns a node for each shape."""
-    server.scene.set_up_direction(tuple(-scene.down))
-    nodes = []
-    for i, (shape, colour) in enumerate(scene.shapes):
-        mesh, flat = shape_mesh(shape), isinstance(shape, Mesh) or shape.kind == "box"
-        vertices, faces = mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
-        look = {"color": tuple(int(255 * c) for c in colour), "opacity": scene.opacity(i)}
-        nodes.append(server.scene.add_mesh_simple(f"/shape_{i}", vertices, faces, flat_shading=flat, **look))
-    position, focus, up = scene.camera
-    server.initial_camera.position = tuple(position)
-    server.initial_camera.look_at = tuple(focus)
-    server.initial_camera.up = tuple(up)
-    server.initial_camera.fov = 0.6  # [rad]
-    return nodes
+def pad_forces(hand: HandDescription, q: Array, normal: Array) -> Array:
+    """The middle of each pad's surface and the force with which it presses there, for :class:`Told`.
+
+    Args:
+        q: ``(n, n_q)`` [rad].
+        normal: ``(n, n_pads)`` [N]; NaN: not known.
+
+    Returns:
+        ``(n, n_pads, 6)``: point [m] and force [N], hand frame.
+    """
+    links = HandKinematics(hand)(torch.as_tensor(q, dtype=torch.float64))
+    found = np.zeros((*normal.shape, 6))
+    for i, pad in enumerate(hand.pads):
+        pose, way = links.of(pad.link).numpy(), np.array(pad.direction) / np.linalg.norm(pad.direction)
+        middle = (np.array(pad.start) + np.array(pad.end)) / 2 + pad.radius * way
+        found[:, i, :3] = pose[:, :3, :3] @ middle + pose[:, :3, 3]
+        found[:, i, 3:] = normal[:, i, None] * (pose[:, :3, :3] @ way)
+    return found
 
 
-def _place(server: Any, nodes: list[Any], transforms: Array) -> None:
-    """Move the nodes to one frame of a scene, ``(n_shapes, 4, 4)``, all at once."""
-    rotation = require("scipy.spatial.transform").Rotation
-    with server.atomic():
-        for node, T in zip(nodes, transforms, strict=True):
-            node.wxyz = rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-            node.position = T[:3, 3]
+def _shape(scene: Scene, i: int, shape: Any, colour: Colour) -> dict[str, Any]:
+    opacity = scene.opacity(i)
+    look = {"colour": colour, "opacity": 1.0 if opacity is None else opacity}
+    if isinstance(shape, Mesh):
+        return {**look, "kind": "mesh", "vertices": _packed(shape.vertices), "faces": _packed(shape.faces)}
+    return {**look, "kind": shape.kind, "size": list(shape.size)}
+
+
+def _curve(told: Told) -> dict[str, Any] | None:
+    if told.turned is None:
+        return None
+    target = None if told.target is None else float(told.target)
+    curve: dict[str, Any] = {"label": "turned [deg]", "values": told.turned.tolist(), "target": target}
+    if told.std is not None:
+        curve["low"] = (told.turned - 2 * told.std).tolist()
+        curve["high"] = (told.turned + 2 * told.std).tolist()
+    return curve
+
+
+def _packed(values: Array) -> str:
+    """As base64 of 32-bit floats: they hold whole numbers up to 16 million."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()

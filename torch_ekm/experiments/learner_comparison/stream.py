@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +17,12 @@ from .table_file import find_columns, open_table
 
 _REST = 0.01  # of the deviation in all: less is rest
 LEAST = 40  #: samples; fewer do not distinguish learners
+
+#: How names of columns say that they hold what a model predicts, and what was measured.
+_PREDICTS = re.compile(
+    r"^(model|pred|predicted|nominal|sim)_|_(model|pred|predicted|nominal|sim|hat)$", re.IGNORECASE
+)
+_MEASURED = re.compile(r"^(meas|measured|real|true)_|_(meas|measured|real|true)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -140,7 +147,7 @@ def load_table(
     outputs = outputs or [name for name in names if _is_residual(name)]
     if not outputs:
         problem = "no column is called 'y' (or y1, y2, ...); name the targets: targets=, or --targets"
-        raise DescriptionError(path, f"{problem}. The columns are {', '.join(names)}")
+        raise DescriptionError(path, f"{problem}{_proposed(names)}. The columns are {', '.join(names)}")
     chosen = chosen or [name for name in names if name not in {*outputs, *model, *runs}]
     if not chosen:
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
@@ -187,3 +194,17 @@ def _is_number_of_run(column: Array) -> bool:
 
 def _is_residual(name: str) -> bool:
     return name == "y" or (name[:1] == "y" and name[1:].isdigit())
+
+
+def _proposed(names: Sequence[str]) -> str:
+    """Options for columns whose names say that one is measured and another predicts it."""
+    plain = {_PREDICTS.sub("", name): name for name in names if _PREDICTS.search(name)}
+    pairs = [
+        (one, plain[what])
+        for one in names
+        if (what := _MEASURED.sub("", one)) in plain and one != plain[what]
+    ]
+    if not pairs:
+        return ""
+    measured, predicted = (",".join(side) for side in zip(*pairs, strict=True))
+    return f"; these look like pairs: --measured {measured} --predicted {predicted}"

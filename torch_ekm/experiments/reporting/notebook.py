@@ -1,29 +1,18 @@
-"""Smoke mode, pictures of the hand, and copies of notebooks, which the notebooks share."""
+"""Where the notebooks are, copies of them, and whether they run in their smallest size."""
 
 from __future__ import annotations
 
 import os
 import shutil
-import tempfile
 from pathlib import Path
-from typing import Any
 
 from ..._files import make_folder
 from ...exceptions import DescriptionError
-from ...rendering import Scene, save_picture
 
 
 def smoke_mode() -> bool:
     """Run everything in its smallest size: ``TORCH_EKM_SMOKE`` is set to anything but 0."""
     return os.environ.get("TORCH_EKM_SMOKE", "0") not in ("", "0")
-
-
-def hand_picture(scene: Scene, frames: tuple[int, ...] = (0,)) -> Any:
-    """A scene as the last line of a notebook cell: these frames of it side by side, an image of IPython."""
-    from IPython.display import Image
-
-    with tempfile.TemporaryDirectory() as folder:
-        return Image(save_picture(scene, Path(folder) / "hand.png", frames=frames).read_bytes())
 
 
 def notebook_folder() -> Path:
