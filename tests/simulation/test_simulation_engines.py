@@ -91,7 +91,7 @@ def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
     plant = SimulatedHand("planar_two_finger", "can", engine="mujoco")
     plant.reset(0)
     rig = plant._grasped()
-    rig.scene.object_pose = (np.array([0.0, 0.0, 1.0]), np.eye(3))
+    rig.scene.place(rig.scene.q, np.array([0.0, 0.0, 1.0]), np.eye(3))
     rig.scene.hold_object(True)
     rig.follow(np.array([[0.5, 0.8]]), np.zeros(1))
     rig.wait(2.0)

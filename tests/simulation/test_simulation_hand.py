@@ -267,7 +267,7 @@ def test_impossible_settings_are_refused(changes):
 
 
 def test_importing_the_simulator_warns_of_nothing():
-    code = "from torch_ekm.simulation.physics.sapien_engine import sapien; sapien()"
+    code = "from torch_ekm.simulation.physics.sapien_scene import sapien; sapien()"
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert "ulkan" not in done.stderr
