@@ -8,7 +8,6 @@ Runs the first hand of the demo; needs a graphics library (OpenGL).
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -73,9 +72,8 @@ def main(path: Path) -> None:
     films = []
     for turn in turns():
         scene, titles = in_between(turn)
-        one = [replace(scene, transforms=frame[None]) for frame in scene.transforms]
-        camera = Picture(one[0], SIZE, smooth=True)
-        drawn = [camera.draw(frame, camera=scene.camera) for frame in one]
+        camera = Picture(scene.meshes, size=SIZE, smooth=True)
+        drawn = [camera.draw(frame[None], scene.camera) for frame in scene.transforms]
         camera.close()
         films.append([titled(*both) for both in zip(drawn, titles, strict=True)])
     length = max(map(len, films))

@@ -147,8 +147,8 @@ class InHandRotation(gymnasium.Env):
         frame = q[None], position[None], rotation[None]
         scene = make_scene(self.plant.hand, self.plant.object, *frame, np.array(self.plant.hand.gravity))
         if self._picture is None:
-            self._picture = Picture(scene)
-        return self._picture.draw(scene)
+            self._picture = Picture(scene.meshes)
+        return self._picture.draw(scene.transforms, scene.camera)
 
     def close(self) -> None:
         """Give back the scene and the window."""
