@@ -123,10 +123,6 @@ class Rig:
         """Steps to the camera's next frame, at least 1: it runs by the clock, whatever the hand does."""
         return self._period - round(self.time / self.config.time_step) % self._period
 
-    def wait_for_frame(self) -> None:
-        """Let time pass until the camera's next frame."""
-        self.wait(self.to_frame * self.config.time_step)
-
     @property
     def state(self) -> TimedState:
         """As it truly is now."""
@@ -219,7 +215,8 @@ class Rig:
 _CHANGING = ("transmission", "servo", "normal", "fingers", "time")
 _TRANSMISSION = (
     "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase",
-    "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed",
+    "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "joint_law",
+    "hardware_seed",
 )  # fmt: skip
 
 
