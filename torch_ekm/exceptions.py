@@ -15,6 +15,7 @@ Python does.
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Iterable
 from typing import Any
 
@@ -26,19 +27,12 @@ class EKMError(Exception):
     """Root of all errors raised by torch_ekm. They survive pickling, to cross process boundaries whole."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (type(self), self.args, self.__dict__)
+        # without the constructor, whose arguments are not kept
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class SpeedWarning(UserWarning):
     """Compiled loops are off, or not there yet: results are the same to rounding, and take longer."""
-
-
-def _restore(kind: type[EKMError], args: tuple[Any, ...], attributes: dict[str, Any]) -> EKMError:
-    """Rebuild an error without its constructor, whose arguments are not kept."""
-    error = kind.__new__(kind)
-    error.args = args
-    error.__dict__.update(attributes)
-    return error
 
 
 class PlacedError(EKMError):

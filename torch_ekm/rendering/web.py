@@ -11,7 +11,6 @@ import numpy as np
 
 from .._extras import require
 from .._files import write_whole
-from ..typing import Array
 from .scene import Scene, shape_mesh
 from .visuals import Mesh
 
@@ -25,13 +24,17 @@ def save_animation(scene: Scene, path: Path) -> Path:
         MissingExtraError: viser is not installed.
         OutputError: ``path`` cannot be written.
     """
+    rotation = require("scipy.spatial.transform").Rotation
     with contextlib.redirect_stdout(io.StringIO()):
         server = require("viser").ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
-            serializer = server.get_scene_serializer()
             nodes = _draw(server, scene)
+            serializer = server.get_scene_serializer()
             for frame in scene.transforms:
-                _place(server, nodes, frame)
+                with server.atomic():
+                    for node, T in zip(nodes, frame, strict=True):
+                        node.wxyz = rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+                        node.position = T[:3, 3]
                 serializer.insert_sleep(0.25)  # [s] for each frame
             page = serializer.as_html()
         finally:
@@ -55,12 +58,3 @@ def _draw(server: Any, scene: Scene) -> list[Any]:
     server.initial_camera.up = tuple(up)
     server.initial_camera.fov = 0.6  # [rad]
     return nodes
-
-
-def _place(server: Any, nodes: list[Any], transforms: Array) -> None:
-    """Move the nodes to one frame of a scene, ``(n_shapes, 4, 4)``, all at once."""
-    rotation = require("scipy.spatial.transform").Rotation
-    with server.atomic():
-        for node, T in zip(nodes, transforms, strict=True):
-            node.wxyz = rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-            node.position = T[:3, 3]

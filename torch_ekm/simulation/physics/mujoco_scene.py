@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,9 @@ class MujocoScene:
         option.impratio, option.noslip_iterations, option.tolerance = 1000.0, 20, 1e-10  # else contacts creep
         link_of = self._add_hand(spec, hand)
         shapes = self._add_object(spec, hand, obj)
-        for geom in link_of:
-            for shape in shapes:
-                self._add_pair(spec, geom, shape)
+        solref, solimp = [_STIFF_TIME * time_step, 1.0], [_IMPEDANCE, _IMPEDANCE, 0.001, 0.5, 2.0]
+        for one, other in itertools.product(link_of, shapes):
+            spec.add_pair(geomname1=one, geomname2=other, condim=3, solref=solref, solimp=solimp)
         self._model: Any = spec.compile()
         self._data: Any = self._mj.MjData(self._model)
         self._arrange(hand, link_of, shapes)
@@ -113,15 +114,6 @@ class MujocoScene:
         quaternion = self._quaternion(at[:3, :3])
         body.add_geom(
             name=name, type=kind, size=size, pos=at[:3, 3], quat=quaternion, contype=0, conaffinity=0
-        )
-
-    def _add_pair(self, spec: Any, first: str, second: str) -> None:
-        spec.add_pair(
-            geomname1=first,
-            geomname2=second,
-            condim=3,
-            solref=[_STIFF_TIME * self.time_step, 1.0],
-            solimp=[_IMPEDANCE, _IMPEDANCE, 0.001, 0.5, 2.0],
         )
 
     def _set_mass(self, body: Any, mass: float, com: Array, inertia: Array) -> None:

@@ -110,7 +110,7 @@ class Rig:
                 self.run(n, lambda part: start + (done + part * n / steps) * (goal - start))  # noqa: B023
                 left -= n
                 if frame and self.to_frame == self._period and not frame():
-                    self.servo.stay()
+                    self.servo.setpoint = self.servo.encoder
                     return
 
     @property
