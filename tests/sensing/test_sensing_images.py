@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from lens import render
 
-from torch_ekm.description import Shape
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
 from torch_ekm.simulation import ImageQuality, SimulatedCamera
@@ -17,14 +16,6 @@ from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, Place
 cv2 = pytest.importorskip("cv2")
 
 CLEAN = ImageQuality(noise=0.0, blur=0.0, vignette=0.0)
-
-
-def inside(polygon, points, margin=0.0):
-    """Which points are inside a convex polygon, by more than ``margin``."""
-    edge = np.roll(polygon, -1, axis=0) - polygon
-    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    distance = np.einsum("pej,ej->pe", points[:, None] - polygon[None], outward)
-    return np.all(distance < -margin, axis=1) | np.all(distance > margin, axis=1)
 
 
 @pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.15, 0.1, 1e-3, -5e-4, 0.0)])
@@ -83,29 +74,6 @@ def test_cards_outside_or_behind_are_not_drawn(pose_of, rng):
         )
     half = pose_of(x=0.4 * 320 / 600)  # cut by the border of the image
     assert (camera.render(CardScene((PlacedCard(MarkerBoard(), half),)), rng) != empty).any()
-
-
-@pytest.mark.parametrize(
-    "shape",
-    [
-        Shape("box", (0.03, 0.02, 0.05), np.eye(4)),
-        Shape("cylinder", (0.01, 0.06), np.eye(4)),
-        Shape("capsule", (0.01, 0.04), np.eye(4)),
-        Shape("sphere", (0.02,), np.eye(4)),
-    ],
-)
-def test_outline_encloses_the_body_tightly(shape, pose_of, rng):
-    camera, pose = PinholeCamera(), pose_of(0.06, 0.05, 0.25, tilt_deg=70)
-    body = ConvexBody.of_shape(shape).moved(pose)
-    polygon = body.outline(camera)
-    d = rng.standard_normal((20000, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    support = body.centres[np.argmax(d @ body.centres.T + body.radii, axis=1)]
-    radius = body.radii[np.argmax(d @ body.centres.T + body.radii, axis=1)]
-    pixels = camera.project(support + radius[:, None] * d)  # points of the surface
-    assert inside(polygon, pixels, margin=-1e-6).all()
-    assert np.abs(pixels.min(0) - polygon.min(0)).max() < 0.6  # px
-    assert np.abs(pixels.max(0) - polygon.max(0)).max() < 0.6
 
 
 def test_impossible_boards_and_bodies_are_refused():

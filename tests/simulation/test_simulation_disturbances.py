@@ -172,7 +172,7 @@ def test_every_preset_grasps(name):
 
 def test_events_happen_when_they_should(exact):
     tug = Tug(at=1, force=(0.0, 0.0, 5.0))
-    tendons = PlantChange.new_tendons(at=2, moment_arm=1.2)
+    tendons = PlantChange(2, {"moment_arm": 1.2})
     disturbed = DisturbedPlant(exact, (tendons, tug))
     assert isinstance(disturbed, Plant)
     still = torch.zeros(9)

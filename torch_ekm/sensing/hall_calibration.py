@@ -158,11 +158,7 @@ class HallCalibration:
 
 
 def _fit(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor, " n"]) -> HallChannel:
-    """Least squares of the cubic on the unsaturated samples; noise and misfit from the residuals.
-
-    Raises:
-        CalibrationError: the joint was not moved, too few samples are unsaturated, or the cubic turns back.
-    """
+    """Least squares of the cubic on the unsaturated samples; noise and misfit from the residuals."""
     name = f"Hall channel of {joint}"
     start, end = float(angles.min()), float(angles.max())
     if end - start < _MIN_TRAVEL:
