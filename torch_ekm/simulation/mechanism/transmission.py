@@ -82,7 +82,7 @@ class Transmission:
         self._pulls_only = np.concatenate(
             [[actuator.tendon for actuator in hand.actuators], np.zeros(len(coupling), bool)]
         ).astype(bool)
-        self._any_tendon = bool(self._pulls_only.any())
+        self._any_tendon, self._any_play = bool(self._pulls_only.any()), bool(losses.play.any())
         self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
         self.friction = hand.joint_friction
         self.shape, self.losses, self.law = shape, losses, law
@@ -98,13 +98,13 @@ class Transmission:
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
         self._compliance = self.losses.compliance(stiffness)
         steep = self._k.copy()
-        steep[: self.n_a] *= self.losses.steepening
+        steep[: self.n_a] *= 1 / (1 - losses.coupling) + (losses.hysteresis > 0)  # bound of dT/ds
         size = np.abs(np.concatenate([self._lead * varied, self._M[self.n_a :], *(arms for _, arms in tied)]))
         steep = np.concatenate([steep, *(k for k, _ in tied)])
         carried = (steep * size.sum(axis=1)) @ size if self.stiff else steep @ size**2
         farthest = np.maximum(hand.joint_upper - self.spring_rest, self.spring_rest - hand.joint_lower)
-        springs = self.spring_stiffness * self.shape.largest_spring_factor(farthest)
-        self._turned = springs + carried * self.shape.largest_arm**2
+        springs = self.spring_stiffness * np.maximum(1.0, 1 + 3 * shape.stiffening * farthest**2)
+        self._turned = springs + carried * (1 + np.abs(shape.variation)) ** 2
         self.drive_stiffness = self._turned + self._k_f
         """Stiffness of each joint's drive ``(n_q,)`` [N m/rad], while all tendons are taut."""
         self.relax(self.spring_rest)
@@ -219,7 +219,7 @@ class Transmission:
             excursion = self.shape.excursion(inner)
             away = self._k_l * self._loops.gap(excursion)
             torque = torque - self.shape.arm(inner) * (away @ self._loops.lengths.jacobian(excursion))
-        if self.losses.any_play:
+        if self._any_play:
             whole = torque + self._turned * self._lean
             half = self.losses.play / 2
             self._lean = np.clip(whole / self._turned, -half, half)
