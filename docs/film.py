@@ -10,7 +10,7 @@ grasp of the same simulated hand; the E-KM has made three other turns before. Ne
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -86,9 +86,8 @@ class Turn:
     def pictures(self, at: Array, hand: SimulatedHand) -> list[Array]:
         """At these times, each the last known one at the latest."""
         scene = self.scene(at, hand)
-        frames = [replace(scene, transforms=frame[None]) for frame in scene.transforms]
-        camera = Picture(frames[0], SIZE, smooth=True)
-        drawn = [camera.draw(frame, camera=scene.camera) for frame in frames]
+        camera = Picture(scene.meshes, size=SIZE, smooth=True)
+        drawn = [camera.draw(frame[None], scene.camera) for frame in scene.transforms]
         camera.close()
         return drawn
 

@@ -183,36 +183,29 @@ def _made_otherwise(module: nn.Module, own: Mapping[str, Any], state: Mapping[st
     return wrong
 
 
-def ill_formed(own: Mapping[str, Any], state: Mapping[str, Any]) -> list[str]:
+def ill_formed(own: Mapping[str, Any], state: Mapping[str, Any], place: str = "") -> list[str]:
     """What is wrong with the entries of ``state``, against a state dict of the same module."""
-    wrong = [f"{name} is missing" for name in own if name not in state]
-    wrong += [f"{name} does not belong here" for name in state if name not in own]
+    wrong = [f"{place}{name} is missing" for name in own if name not in state]
+    wrong += [f"{place}{name} does not belong here" for name in state if name not in own]
     for name, ours in own.items():
-        if name not in state:
-            continue
-        theirs = state[name]
-        if not isinstance(ours, torch.Tensor):
-            wrong += _ill_formed_values(name, ours, theirs)
-        elif not isinstance(theirs, torch.Tensor):
-            wrong.append(f"{name} is no tensor")
-        elif theirs.shape != ours.shape or theirs.dtype != ours.dtype:
-            here = f"{tuple(ours.shape)} of {ours.dtype} here"
-            wrong.append(f"{name}: {tuple(theirs.shape)} of {theirs.dtype} in the state, {here}")
-        elif bool(theirs.isnan().any()):
-            wrong.append(f"{name} holds something that is not a number")
+        if name in state and name != "made_with":
+            wrong += _ill_formed(place + name, ours, state[name], inside=bool(place))
     return wrong
 
 
-def _ill_formed_values(name: str, ours: Any, theirs: Any) -> list[str]:
-    """Of what is no tensor: counts, marks, and mappings of those."""
+def _ill_formed(name: str, ours: Any, theirs: Any, inside: bool) -> list[str]:
+    """Of one entry: a tensor, a count, a mark, or a mapping of those."""
+    if isinstance(ours, torch.Tensor) and not inside:
+        if not isinstance(theirs, torch.Tensor):
+            return [f"{name} is no tensor"]
+        if theirs.shape != ours.shape or theirs.dtype != ours.dtype:
+            here = f"{tuple(ours.shape)} of {ours.dtype} here"
+            return [f"{name}: {tuple(theirs.shape)} of {theirs.dtype} in the state, {here}"]
+        return [f"{name} holds something that is not a number"] if bool(theirs.isnan().any()) else []
     if isinstance(ours, dict) and isinstance(theirs, dict):
-        wrong = [f"{name}.{key} is missing" for key in ours if key not in theirs]
-        wrong += [f"{name}.{key} does not belong here" for key in theirs if key not in ours]
-        pairs = [(key, ours[key], theirs[key]) for key in ours if key in theirs and key != "made_with"]
         # another library's own mappings are looked at by the module that holds them
-        flat = [(key, a, b) for key, a, b in pairs if not (isinstance(a, dict) and isinstance(b, dict))]
-        return wrong + [text for key, a, b in flat for text in _ill_formed_values(f"{name}.{key}", a, b)]
-    if isinstance(ours, dict) or type(ours) is not type(theirs):
+        return [] if inside else ill_formed(ours, theirs, f"{name}.")
+    if type(ours) is not type(theirs):
         return [f"{name}: {type(theirs).__name__} in the state, {type(ours).__name__} here"]
     if isinstance(ours, int) and not 0 <= theirs < 2**53:
         return [f"{name} counts, and is below 0 or beyond 2^53"]
@@ -228,7 +221,7 @@ def _impossible(module: nn.Module, state: Mapping[str, Any]) -> list[str]:
         if type(one).__module__.startswith(("torch_ekm.", "torch.nn.")):
             kept = (*one.named_parameters(recurse=False), *one.named_buffers(recurse=False))
             for name, ours in kept:
-                if name in inner and not in_bounds(inner[name], ours):
+                if name in inner and not _in_bounds(inner[name], ours):
                     wrong.append(f"{lead}{name} is infinite, or counts and is below 0")
         ask = getattr(one, "state_problems", None)
         if ask is not None and not wrong:  # it may count on what was looked at here
@@ -236,7 +229,7 @@ def _impossible(module: nn.Module, state: Mapping[str, Any]) -> list[str]:
     return wrong
 
 
-def in_bounds(theirs: torch.Tensor, ours: torch.Tensor) -> bool:
+def _in_bounds(theirs: torch.Tensor, ours: torch.Tensor) -> bool:
     """Finite where ours is, and no count below 0."""
     if theirs.is_floating_point():  # a limit may be infinite
         return not bool((theirs.isinf() & ours.isfinite()).any())

@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import codecs
 import os
 
 from ._files import read_file
 from .exceptions import DescriptionError
-
-#: first bytes of what is no UTF-8, the longer ones first, and its name for iconv
-_MARKS = (
-    (codecs.BOM_UTF32_LE, "UTF-32"), (codecs.BOM_UTF32_BE, "UTF-32"),
-    (codecs.BOM_UTF16_LE, "UTF-16"), (codecs.BOM_UTF16_BE, "UTF-16"),
-)  # fmt: skip
 
 
 def read_text(path: str | os.PathLike, what: str, largest: int) -> str:
@@ -28,26 +21,17 @@ def decode(content: bytes, path: str | os.PathLike) -> str:
     """UTF-8, with or without a byte order mark.
 
     Raises:
-        DescriptionError: another encoding; the message names the likely one, and how to convert.
+        DescriptionError: another encoding; the message names the place, and how to convert.
     """
-    for mark, name in _MARKS:
-        if content.startswith(mark):
-            raise DescriptionError(path, f"this is {name}, not UTF-8; {_convert(name)}")
-    zero = content.find(b"\0")
-    if zero >= 0:
-        kind = "UTF-16LE" if zero % 2 else "UTF-16BE"
-        problem = f"byte {zero} is 0: no text, or {kind} without a mark; {_convert(kind)}"
-        raise DescriptionError(path, problem)
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line, byte = content.count(b"\n", 0, error.start) + 1, content[error.start]
-        problem = f"line {line}: byte {error.start}, 0x{byte:02x}, is not UTF-8; the file may be Latin-1"
-        raise DescriptionError(path, f"{problem}; {_convert('LATIN1')}") from None
-
-
-def _convert(name: str) -> str:
-    return f"save it as UTF-8, as by 'iconv -f {name} -t UTF-8 OLD > NEW'"
+    bad = content.find(b"\0")  # of every second letter in UTF-16
+    if bad < 0:
+        try:
+            return content.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            bad = error.start
+    line = content.count(b"\n", 0, bad) + 1
+    remedy = "save it as UTF-8, as by 'iconv -f LATIN1 -t UTF-8 OLD > NEW', or with -f UTF-16"
+    raise DescriptionError(path, f"line {line}: byte {bad}, 0x{content[bad]:02x}, is not UTF-8; {remedy}")
 
 
 def figure(text: str) -> float | None:

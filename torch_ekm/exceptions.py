@@ -15,18 +15,9 @@ answer a wrong kind as Python does.
 
 from __future__ import annotations
 
+import copyreg
 from collections.abc import Iterable
 from typing import Any
-
-__all__ = [
-    "BusError", "CalibrationError", "CommandRefusedError", "DescriptionError", "DeviceError", "EKMError",
-    "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspEndsError", "GraspError",
-    "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
-    "NoStateError", "NonFiniteError", "NonMonotoneFitError", "ObjectLostError", "OutputError",
-    "ParameterError", "PenetrationError", "PlantInUseError", "ResumeError", "ShapeError",
-    "SingularGraspError", "SolverError", "SpeedWarning", "StaleReadingError", "StateError",
-    "StateMismatchError", "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
-]  # fmt: skip
 
 _LONGEST = 2000  # characters of a message
 _LONGEST_VALUE = 300  # of a value in one
@@ -36,19 +27,29 @@ class EKMError(Exception):
     """Root of all errors raised by torch_ekm. They survive pickling, to cross process boundaries whole."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (type(self), self.args, self.__dict__)
+        # without the constructor, whose arguments are not kept
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class SpeedWarning(UserWarning):
     """Compiled loops are off, or not there yet: results are the same to rounding, and take longer."""
 
 
-def _restore(kind: type[EKMError], args: tuple[Any, ...], attributes: dict[str, Any]) -> EKMError:
-    """Rebuild an error without its constructor, whose arguments are not kept."""
-    error = kind.__new__(kind)
-    error.args = args
-    error.__dict__.update(attributes)
-    return error
+class PlacedError(EKMError):
+    """Something is wrong at some place: a file, a sensor, a device.
+
+    Attributes:
+        where: file with line, sensor, port, topic or motor.
+        problem: what is wrong with it, and what to do.
+    """
+
+    says = "{where}: {problem}"
+
+    def __init__(self, where: object, problem: object) -> None:
+        self.where, self.problem = str(where), str(problem)
+        if len(self.problem) > _LONGEST:  # of a file that holds a name of a million letters
+            self.problem = f"{self.problem[:_LONGEST]}..."
+        super().__init__(self.says.format(where=where, problem=self.problem))
 
 
 # -- what the user asked for does not exist -----------------------------------------------
@@ -90,14 +91,8 @@ class UnknownNameError(EKMError, KeyError):
 # -- a description of a hand or object is wrong -------------------------------------------
 
 
-class DescriptionError(EKMError, ValueError):
+class DescriptionError(PlacedError, ValueError):
     """A URDF or transmission file cannot be used; the message names the file and the place."""
-
-    def __init__(self, source: object, problem: str) -> None:
-        if len(problem) > _LONGEST:  # of a file that holds a name of a million letters
-            problem = f"{problem[:_LONGEST]}..."
-        self.source, self.problem = str(source), problem
-        super().__init__(f"{source}: {problem}")
 
 
 class JointMismatchError(DescriptionError):
@@ -261,66 +256,31 @@ class StateMismatchError(EKMError, RuntimeError):
 
 
 class NoStateError(EKMError, TypeError):
-    """A learner cannot be saved as plain values.
-
-    Attributes:
-        learner: its kind.
-    """
+    """A learner cannot be saved as plain values."""
 
     def __init__(self, learner: str, reason: str) -> None:
-        self.learner = learner
         super().__init__(f"{learner} cannot be saved as plain values: {reason}")
 
 
-class FileFormatError(EKMError, ValueError):
-    """A file cannot be read as what it should be.
-
-    Attributes:
-        path: of the file.
-        problem: what is wrong with it.
-    """
-
-    def __init__(self, path: object, problem: str) -> None:
-        self.path, self.problem = str(path), problem
-        super().__init__(f"{path}: {problem}")
+class FileFormatError(PlacedError, ValueError):
+    """A file cannot be read as what it should be."""
 
 
-class OutputError(EKMError):
-    """A file cannot be written: the disk is full, or the folder may not be written to.
+class OutputError(PlacedError):
+    """A file cannot be written: the disk is full, or the folder may not be written to."""
 
-    Attributes:
-        path: of the file or folder.
-        problem: what the system says.
-    """
-
-    def __init__(self, path: object, problem: object) -> None:
-        self.path, self.problem = str(path), str(problem)
-        super().__init__(f"{path} cannot be written: {problem}; name a folder that can be written to")
+    says = "{where} cannot be written: {problem}; name a folder that can be written to"
 
 
-class ResumeError(EKMError):
-    """A turn that was cut short cannot be gone on with; the hand holds.
-
-    Attributes:
-        path: of the journal.
-        problem: why not.
-    """
-
-    def __init__(self, path: object, problem: str) -> None:
-        self.path, self.problem = str(path), problem
-        super().__init__(f"{path}: {problem}")
+class ResumeError(PlacedError):
+    """A turn that was cut short cannot be gone on with; the hand holds."""
 
 
 class FolderInUseError(EKMError):
-    """Another writer is at work in a folder that takes one at a time.
-
-    Attributes:
-        folder: which.
-        holder: number of the process (pid) that writes there; None: it did not leave it.
-    """
+    """Another writer, a process whose number (pid) may be known, is at work in a folder that takes one at a
+    time."""
 
     def __init__(self, folder: object, holder: int | None) -> None:
-        self.folder, self.holder = str(folder), holder
         by = "another process" if holder is None else f"process {holder}"
         super().__init__(
             f"{folder} is being written to by {by}; wait until it has ended, or name another folder"
@@ -328,15 +288,9 @@ class FolderInUseError(EKMError):
 
 
 class WorkerDiedError(EKMError):
-    """The process that ran a job ended without a word, as often as the job was tried.
-
-    Attributes:
-        job: its name.
-        tries: how often it was run.
-    """
+    """The process that ran a job ended without a word, as often as the job was tried."""
 
     def __init__(self, job: str, tries: int) -> None:
-        self.job, self.tries = job, tries
         super().__init__(
             f"the job '{job}' was run {tries} times, and its process was killed each time; look for "
             "a lack of memory, or run it with one process"
@@ -366,48 +320,17 @@ class EquilibriumError(SolverError):
 # -- sensors ----------------------------------------------------------------------------------
 
 
-class CalibrationError(EKMError):
-    """A sensor cannot be calibrated from these measurements.
+class CalibrationError(PlacedError):
+    """A sensor cannot be calibrated from these measurements."""
 
-    Attributes:
-        sensor: its name.
-    """
-
-    def __init__(self, sensor: str, problem: str) -> None:
-        self.sensor, self.problem = sensor, problem
-        super().__init__(f"calibration of {sensor}: {problem}")
-
-
-class NonMonotoneFitError(CalibrationError):
-    """A calibration curve that turns back would give two readings to one angle.
-
-    Attributes:
-        reading: where the fitted curve turns.
-    """
-
-    def __init__(self, sensor: str, reading: float, valid: str) -> None:
-        self.reading = reading
-        super().__init__(
-            sensor,
-            f"the fitted curve turns back at reading {reading:.1f}, within {valid}; sweep the joint "
-            "over its whole range, slowly, and leave out readings taken while it was blocked",
-        )
+    says = "calibration of {where}: {problem}"
 
 
 # -- devices ----------------------------------------------------------------------------------
 
 
-class DeviceError(EKMError):
-    """Root of what a driver of a real hand raises.
-
-    Attributes:
-        device: port, topic or motor.
-        problem: what is wrong with it, and what to do.
-    """
-
-    def __init__(self, device: object, problem: str) -> None:
-        self.device, self.problem = str(device), problem
-        super().__init__(f"{device}: {problem}")
+class DeviceError(PlacedError):
+    """Root of what a driver of a real hand raises; ``where`` is a port, a topic or a motor."""
 
 
 class BusError(DeviceError):
@@ -440,14 +363,9 @@ class CommandRefusedError(DeviceError):
 
 
 class PlantInUseError(EKMError):
-    """Another loop or thread commands this plant: one hand has one master.
-
-    Attributes:
-        plant: its kind.
-    """
+    """Another loop or thread commands this plant: one hand has one master."""
 
     def __init__(self, plant: str) -> None:
-        self.plant = plant
         super().__init__(
             f"this {plant} is commanded by another loop, or by this one in another thread; wait until that "
             "has ended, or close its generator of steps"

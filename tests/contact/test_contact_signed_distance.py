@@ -7,7 +7,7 @@ import pytest
 
 from torch_ekm.contact.signed_distance import point_distance, signed_distance
 from torch_ekm.description.shape import Shape
-from torch_ekm.simulation.physics.sapien_bodies import x_axis_to
+from torch_ekm.simulation.physics.links import x_axis_to
 
 SIZES = {"box": (0.09, 0.03, 0.04), "cylinder": (0.02, 0.08), "sphere": (0.025,), "capsule": (0.015, 0.06)}
 

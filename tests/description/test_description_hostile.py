@@ -138,14 +138,9 @@ def test_text_is_utf_8_whoever_wrote_it(name: str, tmp_path: Path) -> None:
     for change in ("\n", "\r\n"):
         path.write_bytes(written.replace("\n", change).encode("utf-8-sig"))
         assert repr(read(first)) == repr(plain)
-    for encoding, named in (
-        ("latin-1", "LATIN1"),
-        ("utf-16", "UTF-16"),
-        ("utf-32", "UTF-32"),
-        ("utf-16-le", "UTF-16LE"),
-    ):
+    for encoding in ("latin-1", "utf-16", "utf-32", "utf-16-le"):
         path.write_bytes(written.encode(encoding))
-        with pytest.raises(DescriptionError, match=f"{name}.*iconv -f {named} -t UTF-8"):
+        with pytest.raises(DescriptionError, match=rf"{name}: line \d+: byte \d+.*is not UTF-8.*iconv"):
             read(first)
 
 

@@ -17,6 +17,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 #: Script: what it needs beyond the core, its arguments, and what its output must show.
 SCRIPTS = {
     "gymnasium_environment": (("sapien", "gymnasium"), [], r"success True"),
+    "own_joint_law": (("sapien",), [], r"force by 0\.[5-9] N"),
     "own_hand": (("sapien",), [], r"KM: stalled .*\nE-KM: reached"),
     "own_task_and_wrapper": (("sapien",), [], r"^reached"),
     "own_learner_in_compare": (("matplotlib",), [], r"kernel average +0\.[1-6]"),

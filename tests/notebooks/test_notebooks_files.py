@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -57,30 +55,6 @@ def test_it_opens_with_a_picture(name: str) -> None:
     kinds = {kind for cell in first for output in outputs_of(cell) for kind in output.get("data", {})}
     assert "image/png" in kinds
     assert any("\nYou learn " in text for text in texts)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_one_title_and_no_level_is_skipped(name: str) -> None:
-    levels, lines = [], []
-    for cell in cells_of(name):
-        if cell["cell_type"] == "markdown":
-            text = re.sub(r"```.*?```", "", "".join(cell["source"]), flags=re.DOTALL)
-            levels += [len(mark) for mark in re.findall(r"^(#+) ", text, flags=re.MULTILINE)]
-            lines += text.splitlines()
-    assert levels[0] == 1
-    assert 1 not in levels[1:]
-    assert all(after <= before + 1 for before, after in pairwise(levels))
-    assert not any(
-        re.search(r"\]\((?!https://)", line) for line in lines
-    )  # a page of the site lies elsewhere
-    assert all(line.count("|") <= 9 for line in lines if line.startswith("|"))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_figures_have_the_style_of_the_package(name: str) -> None:
-    code = "".join("".join(cell["source"]) for cell in cells_of(name) if cell["cell_type"] == "code")
-    assert "rcParams" not in code
-    assert ('plt.style.use("torch_ekm.style")' in code) == ("import matplotlib.pyplot" in code)
 
 
 def test_the_package_draws_in_its_style_and_leaves_the_others_alone() -> None:

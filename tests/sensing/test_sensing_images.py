@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from lens import render
 
-from torch_ekm.description import Shape
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
 from torch_ekm.simulation import ImageQuality, SimulatedCamera
@@ -17,14 +16,6 @@ from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, Place
 cv2 = pytest.importorskip("cv2")
 
 CLEAN = ImageQuality(noise=0.0, blur=0.0, vignette=0.0)
-
-
-def inside(polygon, points, margin=0.0):
-    """Which points are inside a convex polygon, by more than ``margin``."""
-    edge = np.roll(polygon, -1, axis=0) - polygon
-    outward = np.stack([edge[:, 1], -edge[:, 0]], axis=-1) / np.linalg.norm(edge, axis=1, keepdims=True)
-    distance = np.einsum("pej,ej->pe", points[:, None] - polygon[None], outward)
-    return np.all(distance < -margin, axis=1) | np.all(distance > margin, axis=1)
 
 
 @pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.15, 0.1, 1e-3, -5e-4, 0.0)])
@@ -72,32 +63,6 @@ def test_a_ball_hides_a_card_only_from_before(pose_of, rng, depth, hidden):
         np.testing.assert_array_equal(image, free)
 
 
-def test_the_nearer_card_wins(pose_of, rng):
-    camera = SimulatedCamera(quality=CLEAN)
-    near = PlacedCard(MarkerBoard(0), pose_of(z=0.30, tilt_deg=0))
-    far = PlacedCard(MarkerBoard(4), pose_of(z=0.40, tilt_deg=0))
-    alone = camera.render(CardScene((near,)), rng)
-    both = camera.render(CardScene((near, far)), rng)
-    width = int(0.5 * 0.052 / 0.40 * 600) - 1  # the far card would have covered this much
-    window = np.s_[240 - width : 240 + width, 320 - width : 320 + width]
-    np.testing.assert_array_equal(alone[window], both[window])
-
-
-def test_back_of_a_card_shows_no_markers(pose_of, rng):
-    pose = pose_of()
-    pose[:3, :3] = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
-    image = SimulatedCamera(quality=CLEAN).render(CardScene((PlacedCard(MarkerBoard(), pose),)), rng)
-    assert len(np.unique(image)) < 60
-    assert image.min() > 100  # no black print
-
-
-def test_noise_and_blur_have_the_stated_size(rng):
-    quality = ImageQuality(noise=5.0, blur=0.0, vignette=0.0)
-    image = SimulatedCamera(quality=quality).render(CardScene(), rng).astype(float)
-    assert image.std() == pytest.approx(np.hypot(5.0, 12**-0.5), rel=0.01)
-    assert image.mean() == pytest.approx(quality.background, abs=0.1)
-
-
 def test_cards_outside_or_behind_are_not_drawn(pose_of, rng):
     camera = SimulatedCamera(quality=CLEAN)
     empty = camera.render(CardScene(), rng)
@@ -109,29 +74,6 @@ def test_cards_outside_or_behind_are_not_drawn(pose_of, rng):
         )
     half = pose_of(x=0.4 * 320 / 600)  # cut by the border of the image
     assert (camera.render(CardScene((PlacedCard(MarkerBoard(), half),)), rng) != empty).any()
-
-
-@pytest.mark.parametrize(
-    "shape",
-    [
-        Shape("box", (0.03, 0.02, 0.05), np.eye(4)),
-        Shape("cylinder", (0.01, 0.06), np.eye(4)),
-        Shape("capsule", (0.01, 0.04), np.eye(4)),
-        Shape("sphere", (0.02,), np.eye(4)),
-    ],
-)
-def test_outline_encloses_the_body_tightly(shape, pose_of, rng):
-    camera, pose = PinholeCamera(), pose_of(0.06, 0.05, 0.25, tilt_deg=70)
-    body = ConvexBody.of_shape(shape).moved(pose)
-    polygon = body.outline(camera)
-    d = rng.standard_normal((20000, 3))
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    support = body.centres[np.argmax(d @ body.centres.T + body.radii, axis=1)]
-    radius = body.radii[np.argmax(d @ body.centres.T + body.radii, axis=1)]
-    pixels = camera.project(support + radius[:, None] * d)  # points of the surface
-    assert inside(polygon, pixels, margin=-1e-6).all()
-    assert np.abs(pixels.min(0) - polygon.min(0)).max() < 0.6  # px
-    assert np.abs(pixels.max(0) - polygon.max(0)).max() < 0.6
 
 
 def test_impossible_boards_and_bodies_are_refused():
@@ -149,20 +91,6 @@ def test_impossible_boards_and_bodies_are_refused():
         PinholeCamera(fx=0.0)
     with pytest.raises(ParameterError, match="distortion"):
         PinholeCamera(distortion=(0.1, 0.0))
-
-
-def test_marker_edges_fall_where_the_board_says():
-    """Sizes that are no multiple of the texel: the edge of the print, at half height, is still right."""
-    board = MarkerBoard(marker_size=0.01737, gap=0.0043, margin=0.0051)
-    texture = board.texture().astype(float)
-    scale = texture.shape[1] / board.size[0]
-    for marker in range(board.n_markers):
-        x0, y0 = board.corners[marker, 0, :2]
-        row = int((board.size[1] / 2 - y0 + board.marker_size / 12) * texture.shape[0] / board.size[1])
-        start = int((x0 + board.size[0] / 2 - 0.003) * scale)
-        stop = int((x0 + board.size[0] / 2 + board.marker_size / 12) * scale)
-        white_length = (texture[row, start:stop] / 255).sum()  # texels of white before the black rim
-        assert start + white_length == pytest.approx((x0 + board.size[0] / 2) * scale, abs=0.06)
 
 
 @pytest.mark.filterwarnings("error")

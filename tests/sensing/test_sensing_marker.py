@@ -146,13 +146,6 @@ def test_a_jump_is_believed_when_seen_three_times(pose_of, simulated, rng, shift
     assert tracker.track(simulated.render(before, rng)).ok
 
 
-def test_small_motion_is_followed(pose_of, simulated, rng):
-    tracker = MarkerTracker(simulated.camera, PALM, OBJECT)
-    for step in range(6):
-        track = tracker.track(simulated.render(scene_of(pose_of, 0.003 * step, 3.0 * step), rng))
-        assert track.ok, step
-
-
 def test_one_marker_alone_is_not_enough(pose_of, simulated, rng):
     boards = MarkerBoard(0), MarkerBoard(4, columns=2, rows=1)
     scene = scene_of(pose_of, boards=boards)

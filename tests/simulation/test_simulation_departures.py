@@ -199,3 +199,19 @@ def test_one_side_of_the_object_has_less_friction() -> None:
         plant.close()
     mu = plant.object.friction
     assert sides == {(mu, round(0.6 * mu, 6)), (round(0.6 * mu, 6), mu)}
+
+
+def test_a_law_of_ones_own_adds_its_torques_and_each_grasp_has_a_copy_of_it() -> None:
+    class Law:
+        calls = 0
+
+        def __call__(self, q: np.ndarray, pull: np.ndarray) -> np.ndarray:
+            self.calls += 1
+            return -0.1 * q + pull @ HAND.actuation_jacobian * 0.5
+
+    q, mine = flexed(), Law()
+    plain, own = (make_transmission(HAND, PlantParameters(joint_law=law)) for law in (None, mine))
+    motor = taut(plain, q)
+    law = -0.1 * q + plain.actuator_torque(q, motor) @ HAND.actuation_jacobian * 0.5
+    np.testing.assert_allclose(torque(own, q, motor), torque(plain, q, motor) + law, atol=1e-12)
+    assert (own.law.calls, mine.calls) == (1, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ import pytest
 import torch
 from turning_step import true_state, turning_step
 
-from torch_ekm.description import load_hand
 from torch_ekm.exceptions import UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.kinematics.se3 import log
@@ -77,21 +75,12 @@ def test_one_seed_gives_one_run_and_a_snapshot_goes_back() -> None:
         assert torch.equal(first.q, second.q)
 
 
-def test_a_held_object_stays() -> None:
-    plant = mujoco_hand()
-    before = plant.reset(3)
-    plant.wait(1.0)
-    after = plant.observe()
-    assert angle(before, after) < 0.02
-    assert shift(before, after) < 0.02
-
-
 def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
     """A free planar finger: ``K_s (q - q0) = J_a^T k_a (m - a0 - J_a q)``."""
     plant = SimulatedHand("planar_two_finger", "can", engine="mujoco")
     plant.reset(0)
     rig = plant._grasped()
-    rig.scene.object_pose = (np.array([0.0, 0.0, 1.0]), np.eye(3))
+    rig.scene.place(rig.scene.q, np.array([0.0, 0.0, 1.0]), np.eye(3))
     rig.scene.hold_object(True)
     rig.follow(np.array([[0.5, 0.8]]), np.zeros(1))
     rig.wait(2.0)
@@ -103,14 +92,6 @@ def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
     rig.follow(np.zeros((1, 2)), np.zeros(1))
     rig.wait(2.0)
     np.testing.assert_allclose(rig.scene.q, hand.spring_rest, atol=1e-3)
-
-
-def test_couplings_hold_from_the_rest_on() -> None:
-    hand, rest = load_hand("icub_right"), np.zeros(20)
-    rest[hand.joint_names.index("ring_0")], rest[hand.joint_names.index("little_1")] = 0.1, -0.05
-    plant = SimulatedHand(dataclasses.replace(hand, spring_rest=rest), "box", engine="mujoco")
-    q = plant.reset(3).truth.q.numpy()
-    np.testing.assert_allclose(hand.coupling @ (q - rest), 0, atol=0.01)
 
 
 def test_soft_pads_give_way_by_force_over_stiffness() -> None:

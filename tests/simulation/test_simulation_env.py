@@ -123,19 +123,15 @@ def test_a_target_that_is_no_angle_is_refused(env):
         env.reset(options={"angel": 0.1})
 
 
-def test_it_is_vectorised_in_processes():
-    code = f"""
-import gymnasium, numpy as np
-envs = gymnasium.make_vec("{ID}", num_envs=2, vectorization_mode="async", hand="planar_two_finger")
-first, _ = envs.reset(seed=[0, 1])
-again, _ = envs.reset(seed=[1, 1])
-assert first.shape == (2, 16) and not np.array_equal(first[0], first[1])
-assert np.array_equal(again[0], again[1]) and np.array_equal(again[1], first[1])
-envs.step(np.zeros((2, 2), dtype=np.float32))
-envs.close()
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
+def test_it_is_vectorised():
+    envs = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="sync", hand="planar_two_finger")
+    first, _ = envs.reset(seed=[0, 1])
+    again, _ = envs.reset(seed=[1, 1])
+    assert first.shape == (2, 16)
+    assert not np.array_equal(first[0], first[1])
+    assert np.array_equal(again[0], again[1])
+    assert np.array_equal(again[1], first[1])
+    envs.close()
 
 
 def test_it_draws_the_object_in_the_hand():

@@ -77,10 +77,10 @@ def test_where_watch_answers_false_the_motors_stand_and_the_set_point_with_them(
 @pytest.mark.usefixtures("unchecked")
 def test_a_path_of_another_hand_moves_nothing() -> None:
     plant = hand()
-    before = plant.hand_state()[0].copy()
+    before = plant.observe().truth.q
     with pytest.raises(ShapeError):
         plant.follow(Path(torch.zeros(1, 3), torch.ones(1)), lambda seen: True)
-    assert np.array_equal(before, plant.hand_state()[0])
+    assert torch.equal(before, plant.observe().truth.q)
 
 
 def test_a_dead_zone_holds_a_motor_back_once_in_each_direction() -> None:

@@ -31,68 +31,12 @@ def flexed(hand, generator):
     return hand.joint_lower + generator.uniform(0.2, 0.6, hand.n_q) * (hand.joint_upper - hand.joint_lower)
 
 
-def equilibrium(transmission, motor, external=0.0):
-    """Frictionless free posture ``K q = K_s q0 + J_a^T k_a (m - a0) + tau_ext`` ``(n_q,)`` [rad].
-
-    Slack tendons are found by repetition; joint stops are not part of it.
-    """
-    T = transmission
-    load = T.spring_stiffness * T.spring_rest + external
-    taut = np.ones(len(T._k), bool)
-    aim = np.concatenate([motor - T.offset, np.zeros(len(T._k) - T.n_a)])
-    for _ in range(1 + int(T._pulls_only.sum())):
-        k = T._k * taut
-        K = np.diag(T.spring_stiffness) + T._M.T @ (k[:, None] * T._M)
-        q = np.linalg.solve(K, load + T._M.T @ (k * aim))
-        slack = T._pulls_only & (aim - T._M @ q < 0)
-        if np.array_equal(~slack, taut):
-            break
-        taut = ~slack
-    return q
-
-
-def test_drives_give_the_gradient_of_the_elastic_energy():
-    hand, transmission = make()
-    generator = np.random.default_rng(0)
-    q = coupled_posture(hand.coupling) @ flexed(hand, generator)
-    motor = hand.actuator_offset + hand.actuation_jacobian @ q + 0.1  # taut everywhere
-
-    def energy(x):
-        stretch = motor - hand.actuator_offset - hand.actuation_jacobian @ coupled_posture(hand.coupling) @ x
-        away = x - coupled_posture(hand.coupling) @ x
-        spring = hand.spring_stiffness @ (x - hand.spring_rest) ** 2
-        return (spring + 4.0 * stretch @ stretch + 8.0 * away @ away) / 2
-
-    step = 1e-6
-    gradient = [(energy(q + step * e) - energy(q - step * e)) / (2 * step) for e in np.eye(hand.n_q)]
-    np.testing.assert_allclose(torque(transmission, q, motor), -np.array(gradient), atol=1e-8)
-
-
 def test_couplings_hold_for_the_joints_that_lead():
     hand, _ = make()
     S = coupled_posture(hand.coupling)
     np.testing.assert_allclose(hand.coupling @ S, 0.0, atol=1e-12)
     np.testing.assert_allclose(S @ S, S, atol=1e-12)
     assert S[hand.joint_names.index("index_0"), hand.joint_names.index("index_0")] == 1.0
-
-
-def test_equilibrium_is_where_the_drives_rest():
-    hand, transmission = make()
-    motor = hand.actuator_offset + np.array([-0.3, 0.8, 0.4, 1.0, 0.5, 1.2, 0.3, 0.9, 0.6])
-    load = np.zeros(hand.n_q)
-    load[hand.joint_names.index("index_3")] = -0.05
-    q = equilibrium(transmission, motor, load)
-    np.testing.assert_allclose(torque(transmission, q, motor), -load, atol=1e-10)
-
-
-def test_free_joints_of_a_tendon_share_its_travel_evenly():
-    hand, transmission = make()
-    motor = hand.actuator_offset.copy()
-    motor[hand.actuator_names.index("index_distal")] = 1.0
-    q = equilibrium(transmission, motor)
-    share = q[[hand.joint_names.index("index_2"), hand.joint_names.index("index_3")]]
-    # 2 springs of 0.15 in series with 4 N m/rad on their sum: 0.15 x = 4 (1 - 2 x)
-    np.testing.assert_allclose(share, 4.0 / 8.15, atol=1e-3)
 
 
 def test_a_slack_tendon_does_not_push_and_a_looped_cable_does():
@@ -153,19 +97,6 @@ def test_a_new_tendon_takes_over_the_torque_of_the_old():
     new.take_over(old, q, motor)
     np.testing.assert_allclose(torque(new, q, motor), torque(old, q, motor), atol=1e-12)
     assert np.abs(torque(new, q, motor + 0.1) - torque(old, q, motor + 0.1)).max() > 0.1
-
-
-def test_a_hand_without_couplings():
-    hand, transmission = make(load_hand("planar_two_finger"))
-    q = equilibrium(transmission, np.full(hand.n_a, 0.5))
-    np.testing.assert_allclose(torque(transmission, q, np.full(hand.n_a, 0.5)), 0.0, atol=1e-10)
-
-
-def test_description_is_not_changed():
-    hand, transmission = make()
-    offset = dataclasses.replace(hand).actuator_offset.copy()
-    transmission.lengthen(0.1)
-    np.testing.assert_array_equal(hand.actuator_offset, offset)
 
 
 def resting_off_zero():

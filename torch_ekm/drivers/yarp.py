@@ -242,7 +242,7 @@ class _Stream:
         """Its numbers, and when they came [s]; of the first message it waits for a second."""
         self._came.wait(_TIMEOUT)
         if (failure := self._failure) is not None:
-            raise BusError(failure.device, failure.problem)
+            raise BusError(failure.where, failure.problem)
         if self._newest is None:
             raise BusError(f"YARP port {self.name}", "it sends nothing")
         return self._newest

@@ -26,7 +26,7 @@ from ..simulation.grasp_planning.doctor import Cure, smallest_changes
 from ..simulation.grasp_planning.pinch import pinch_problem
 from ..simulation.grasp_planning.requirements import direction_unmet, unmet
 from ..simulation.parameters import PlantParameters
-from ..simulation.physics.sapien_bodies import x_axis_to
+from ..simulation.physics.links import x_axis_to
 from ..typing import Array
 from .row import Check, State
 

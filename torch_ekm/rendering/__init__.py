@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from .image import Picture, save_picture
+from .drawing import Picture
+from .image import save_picture
 from .scene import Scene, make_scene
 from .web import Told, save_animation
 

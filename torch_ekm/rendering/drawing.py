@@ -21,17 +21,23 @@ Drawn = tuple[NDArray[np.float64], NDArray[np.int64], tuple[float, float, float]
 Camera = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 
-class Plotter:
-    """Frames side by side, drawn as often as they change.
+class Picture:
+    """Frames side by side, drawn off screen by PyVista as often as they change.
 
     Args:
-        meshes: the same in each frame.
+        meshes: the same in each frame; :attr:`Scene.meshes`.
         frames: their number.
         size: width and height of one frame [pixel].
         smooth: without jagged edges; takes longer.
     """
 
-    def __init__(self, meshes: Sequence[Drawn], frames: int, size: tuple[int, int], smooth: bool) -> None:
+    def __init__(
+        self,
+        meshes: Sequence[Drawn],
+        frames: int = 1,
+        size: tuple[int, int] = (480, 360),
+        smooth: bool = False,
+    ) -> None:
         import pyvista
 
         self._plotter: Any = pyvista.Plotter(
@@ -71,4 +77,4 @@ class Plotter:
 
 if __name__ == "__main__":
     meshes, transforms, camera, path, size = pickle.load(sys.stdin.buffer)
-    Plotter(meshes, len(transforms), size, smooth=True).draw(transforms, camera, path)
+    Picture(meshes, len(transforms), size, smooth=True).draw(transforms, camera, path)

@@ -14,6 +14,7 @@ from ..exceptions import DescriptionError
 from ..kinematics import HandKinematics
 from ..kinematics.se3 import log
 from ..typing import Array
+from .drawing import Drawn
 from .visuals import Mesh, visuals
 
 Colour = tuple[float, float, float]
@@ -41,6 +42,20 @@ class Scene:
     def opacity(self, shape: int) -> float | None:
         """Of a shape; None: it hides what is behind it."""
         return 0.35 if shape >= len(self.shapes) - self.ghosts else None
+
+    @property
+    def meshes(self) -> list[Drawn]:
+        """What :class:`Picture` draws.
+
+        Raises:
+            MissingExtraError: pyvista or trimesh is not installed.
+        """
+        require("pyvista")
+        meshes = [(shape_mesh(shape), colour) for shape, colour in self.shapes]
+        return [
+            (np.array(mesh.vertices), np.array(mesh.faces), colour, self.opacity(i))
+            for i, (mesh, colour) in enumerate(meshes)
+        ]
 
     @property
     def camera(self) -> tuple[Array, Array, Array]:

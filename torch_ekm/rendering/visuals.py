@@ -118,7 +118,12 @@ def _part(path: Path, element: ET.Element) -> Shape | Mesh:
 
 
 def _load(urdf: Path, name: str) -> Any:
-    file = _find(urdf, name)
+    places = [urdf.parent / name.removeprefix("file://")]
+    if name.startswith("package://"):
+        package, _, inside = name.removeprefix("package://").partition("/")
+        parts = (f"{package}/{inside}", inside) if inside else ()
+        places = [above / part for above in urdf.parents for part in parts]
+    file = next((place for place in places if place.is_file()), None)
     if file is None:
         raise ValueError(f"the mesh '{name}' is not there")
     if file.suffix.lower() not in _SUFFIXES:
@@ -132,16 +137,6 @@ def _load(urdf: Path, name: str) -> Any:
     if not len(mesh.faces) or not np.isfinite(mesh.vertices).all():
         raise ValueError(f"the mesh '{name}' has no faces, or vertices that are not finite")
     return mesh
-
-
-def _find(urdf: Path, name: str) -> Path | None:
-    rest = name.removeprefix("file://")
-    places = [urdf.parent / rest]
-    if name.startswith("package://"):
-        package, _, inside = name.removeprefix("package://").partition("/")
-        parts = (f"{package}/{inside}", inside) if inside else ()
-        places = [above / part for above in urdf.parents for part in parts]
-    return next((place for place in places if place.is_file()), None)
 
 
 def _numbers(text: str, n: int) -> list[float]:

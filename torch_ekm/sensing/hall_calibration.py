@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 
 from .._checks import check_finite
-from ..exceptions import CalibrationError, NonMonotoneFitError, ParameterError, ShapeError
+from ..exceptions import CalibrationError, ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 
 _FULL_SCALE = 255.0
@@ -126,8 +126,8 @@ class HallCalibration:
         Raises:
             ShapeError, NonFiniteError: samples that do not fit together, or NaN.
             ParameterError: readings outside 0..255.
-            CalibrationError: a joint was not moved, or too few samples are unsaturated.
-            NonMonotoneFitError: a fitted curve turns back within its range.
+            CalibrationError: a joint was not moved, too few samples are unsaturated, or a fitted curve turns
+                back within its range.
         """
         readings, angles = readings.to(torch.float64), angles.to(torch.float64)
         if readings.ndim != 2 or readings.shape[1] != len(joints):
@@ -158,12 +158,7 @@ class HallCalibration:
 
 
 def _fit(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor, " n"]) -> HallChannel:
-    """Least squares of the cubic on the unsaturated samples; noise and misfit from the residuals.
-
-    Raises:
-        CalibrationError: the joint was not moved, or too few samples are unsaturated.
-        NonMonotoneFitError: the cubic turns back within its range.
-    """
+    """Least squares of the cubic on the unsaturated samples; noise and misfit from the residuals."""
     name = f"Hall channel of {joint}"
     start, end = float(angles.min()), float(angles.max())
     if end - start < _MIN_TRAVEL:
@@ -195,7 +190,9 @@ def _check_monotone(name: str, c: Tensor, low: float, high: float) -> None:
     turning = torch.nonzero(torch.sign(slope[1:]) != torch.sign(slope[:-1]))
     if len(turning):
         at = float(r[turning[0, 0]]) * _FULL_SCALE
-        raise NonMonotoneFitError(name, at, f"{low:.0f}..{high:.0f}")
+        problem = f"the fitted curve turns back at reading {at:.1f}, within {low:.0f}..{high:.0f}"
+        remedy = "sweep the joint over its whole range, slowly, without readings taken while it was blocked"
+        raise CalibrationError(name, f"{problem}; {remedy}")
 
 
 def _split(residual: Tensor, slope: Tensor) -> tuple[float, float]:

@@ -25,11 +25,6 @@ class PlantChange:
         """Give ``plant`` the new parameters, now."""
         plant.change(**self.changes)
 
-    @classmethod
-    def new_tendons(cls, at: int, moment_arm: float | tuple[float, ...]) -> PlantChange:
-        """All tendons replaced: other moment arms, and no elongation yet."""
-        return cls(at, {"moment_arm": moment_arm, "tendon_elongation": 0.0})
-
 
 @dataclass(frozen=True)
 class Tug:

@@ -143,12 +143,12 @@ class InHandRotation(gymnasium.Env):
         """A picture ``(height, width, 3)`` of the true state, or None without a render mode."""
         if self.render_mode is None:
             return None
-        q, position, rotation = self.plant.hand_state()
-        frame = q[None], position[None], rotation[None]
-        scene = make_scene(self.plant.hand, self.plant.object, *frame, np.array(self.plant.hand.gravity))
+        hand, truth = self.plant.hand, self._truth
+        q, position, rotation = (part[None].numpy() for part in (truth.q, truth.position, truth.rotation))
+        scene = make_scene(hand, self.plant.object, q, position, rotation, np.array(hand.gravity))
         if self._picture is None:
-            self._picture = Picture(scene)
-        return self._picture.draw(scene)
+            self._picture = Picture(scene.meshes)
+        return self._picture.draw(scene.transforms, scene.camera)
 
     def close(self) -> None:
         """Give back the scene and the window."""
@@ -162,6 +162,7 @@ class InHandRotation(gymnasium.Env):
         since the reset [rad]."""
         assert self._start is not None
         assert observation.truth is not None
+        self._truth = observation.truth
         rotation = log(observation.rotation @ self._start.rotation.mT)
         turned = float(rotation @ self._axis)
         to_go, off = self._target - turned, float(torch.linalg.vector_norm(rotation - turned * self._axis))

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from ..exceptions import ParameterError
+from ..typing import Array
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,10 @@ class PlantParameters:
     """The pull of one tendon lengthens the others: their share of its own stretch, below 1."""
     joint_play: float = 0.0
     """Full width of the play of one joint of each finger [rad]; which one is drawn from ``hardware_seed``."""
+    joint_law: Callable[[Array, Array], Array] | None = None
+    """A law of one's own: torques that it adds at the joints ``(n_q,)`` [N m], of their angles ``(n_q,)``
+    [rad] and the torques of the actuators ``(n_a,)`` [N m], asked at each time step. It may remember: each
+    grasp begins with a copy. Grasps are planned without it; slopes of some N m/rad are not stable."""
     contact_stiffness: float = 0.0
     """Of each contact [N/m]: pads give way; 0: they do not. A change holds from the next grasp on."""
 
@@ -116,7 +122,7 @@ class PlantParameters:
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if field.name == "stuck_joints":
+            if field.name in ("stuck_joints", "joint_law"):
                 continue
             entries = value if isinstance(value, tuple) else (value,)
             if not all(math.isfinite(entry) for entry in entries):

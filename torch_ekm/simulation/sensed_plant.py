@@ -16,7 +16,7 @@ from ..sensing.joint_estimator import JointEstimator
 from ..sensing.vision.board import MarkerBoard
 from ..sensing.vision.track import Track
 from ..sensing.vision.tracker import MarkerTracker
-from ..typing import Float, Tensor
+from ..typing import Tensor
 from .hall_sensors import HallSensors
 from .imaging.card_scene import CardScene
 from .imaging.grasp_view import GraspView
@@ -116,7 +116,9 @@ class SensedPlant(PlantWrapper):
             )
         elif status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
-        q, raw = seen.q, {"corners": self._corners(track)}
+        ids, missing = [number for board in self.boards for number in board.ids], np.full((4, 2), np.nan)
+        corners = np.stack([track.markers.get(number, missing) for number in ids])
+        q, raw = seen.q, {"corners": torch.from_numpy(corners)}
         unknown = torch.full((6, 6), torch.nan, dtype=torch.float64)
         estimate = {"pose_covariance": unknown if track.covariance is None else track.covariance}
         if self.keep_images:
@@ -142,12 +144,6 @@ class SensedPlant(PlantWrapper):
             if track.ok:
                 break
         return track, image
-
-    def _corners(self, track: Track) -> Float[Tensor, "n 4 2"]:
-        """Of all markers of both boards [px], NaN where not found."""
-        ids = [number for board in self.boards for number in board.ids]
-        missing = np.full((4, 2), np.nan)
-        return torch.from_numpy(np.stack([track.markers.get(number, missing) for number in ids]))
 
 
 def _truth_of(seen: Observation) -> Truth:

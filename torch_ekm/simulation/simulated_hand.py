@@ -231,11 +231,6 @@ class SimulatedHand:
         """Hand and object as they really are, for a model without mismatch (an upper bound in reports)."""
         return true_hand(self.hand, self.parameters), true_object(self.object, self.parameters)
 
-    def hand_state(self) -> tuple[Array, Array, Array]:
-        """True joint angles [rad], object position [m] and rotation, for pictures."""
-        scene = self._grasped().scene
-        return scene.q, *scene.object_pose
-
     def snapshot(self) -> PlantSnapshot:
         """Physics, sensors and noise of this moment, for :meth:`restore`."""
         sensors, generator = copy.deepcopy(self._sensors), dict(self._generator.bit_generator.state)
@@ -290,7 +285,7 @@ class SimulatedHand:
         rig, before = self._grasped(), None
         moved = rig.time
         while rig.time < moved + _LONGEST_REST:
-            rig.wait_for_frame()
+            rig.wait(rig.to_frame * self.config.time_step)
             frame = self._sensors.frame(rig.state, self._generator)
             if frame.time > (moved if before is None else before.time) + 1e-9:
                 if before is not None and self._sensors.agree(before, frame):

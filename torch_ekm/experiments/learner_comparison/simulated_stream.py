@@ -29,7 +29,7 @@ def record_simulated_hand(n: int = 400, seed: int = 1000) -> Stream:
     """
     draw = np.random.default_rng(seed)
     plant = SimulatedHand("icub_right", "box", preset="nominal")
-    disturbed = DisturbedPlant(plant, [PlantChange.new_tendons(n // 2, 0.85)])
+    disturbed = DisturbedPlant(plant, [PlantChange(n // 2, {"moment_arm": 0.85, "tendon_elongation": 0.0})])
     model = KinematicModel(plant.hand, plant.object)
     safety = Safety(rule=StoppingRule(max_steps=10))
     enhanced, x, y, segments = None, [], [], []

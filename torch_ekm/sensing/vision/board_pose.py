@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -39,14 +38,6 @@ class BoardPose:
     """Of the twist ``(v; w)`` of the card about its centre, camera axes, ``(6, 6)`` [m, rad]."""
     ambiguous: bool
     """Another pose explains the image as well; ``prior`` decided, if one was given."""
-
-
-class _Fit(NamedTuple):
-    rotation: Array
-    position: Array
-    covariance: Array
-    residual: Array
-    """Distance of each side point from its edge, infinite where there is none, ``(n,)`` [px]."""
 
 
 def estimate_board_pose(
@@ -85,17 +76,17 @@ def estimate_board_pose(
     if not found:
         return None
     ambiguous = False
+    poses = [pose for pose, _ in found]
     if len(found) == 2:
-        seen = [fit.residual[np.isfinite(fit.residual)] for fit in found]
+        seen = [residual[np.isfinite(residual)] for _, residual in found]
         variance = max(_EDGE_STD**2, min(float(np.median(r**2)) * 2.2 for r in seen)) * _CORRELATED
-        costs = [float(np.minimum(fit.residual**2 / variance, 9.0).sum()) for fit in found]
-        found = [found[k] for k in np.argsort(costs)]
-        apart = angle_between(found[0].rotation, found[1].rotation) > np.radians(10)
+        costs = [float(np.minimum(residual**2 / variance, 9.0).sum()) for _, residual in found]
+        poses = [poses[k] for k in np.argsort(costs)]
+        apart = angle_between(poses[0].rotation, poses[1].rotation) > np.radians(10)
         ambiguous = bool(apart and abs(costs[1] - costs[0]) < 9)
         if ambiguous and prior is not None:
-            found.sort(key=lambda fit: angle_between(fit.rotation, prior))
-    best = found[0]
-    return BoardPose(best.rotation, best.position, best.covariance, ambiguous)
+            poses.sort(key=lambda pose: angle_between(pose.rotation, prior))
+    return replace(poses[0], ambiguous=ambiguous)
 
 
 def _from_corners(
@@ -141,8 +132,9 @@ def _both_poses(camera: PinholeCamera, X: Array, u: Array) -> Iterator[tuple[Arr
 
 def _fit(
     image: NDArray, camera: PinholeCamera, board: MarkerBoard, rotation: Array, position: Array
-) -> _Fit | None:
-    """Gauss-Newton from one start; None where there are too few edges, or those of something else."""
+) -> tuple[BoardPose, Array] | None:
+    """Gauss-Newton from one start, and the distance of each side point from its edge, infinite where there is
+    none ``(n,)`` [px]; None where there are too few edges, or those of something else."""
     X, along = _side_points(board)
     half_width = _half_width(camera, board, rotation, position)
     first = camera.project(X @ rotation.T + position)
@@ -166,7 +158,7 @@ def _fit(
         remaining = offset[used] - rows @ step
         variance = _variance(remaining, np.flatnonzero(used) // _PER_SIDE)
         covariance = np.asarray(variance * np.linalg.inv(rows.T @ rows))
-        fit = _Fit(rotation, position, covariance, np.where(valid, offset, np.inf))
+        fit = BoardPose(rotation, position, covariance, False), np.where(valid, offset, np.inf)
     moved = camera.project(X @ rotation.T + position) - first
     return fit if float(np.abs(moved).max()) < _REACH else None
 

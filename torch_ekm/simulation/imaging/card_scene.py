@@ -67,7 +67,9 @@ class ConvexBody:
         return ConvexBody(self.centres @ transform[:3, :3].T + transform[:3, 3], self.radii, self.shade)
 
     def outline(self, camera: PinholeCamera) -> Array | None:
-        """Convex outline in the image, ``(m, 2)`` [px]; None where the body is not before the camera.
+        """Convex outline in the image, ``(m, 2)`` [px], counter-clockwise for u to the right, v up.
+
+        None where the body is not before the camera.
 
         A ball of centre c and radius r shows its circle about ``c (1 - r^2/d^2)`` of radius
         ``r sqrt(1 - r^2/d^2)``, normal to c, with ``d = |c|``; and the picture of a convex hull
@@ -87,7 +89,10 @@ class ConvexBody:
             circle = np.cos(angle)[:, None] * first[:, None] + np.sin(angle)[:, None] * second[:, None]
             radius = self.radii * np.sqrt(shrink) / np.cos(np.pi / _PER_BALL)  # the polygon circumscribes
             points = self.centres[:, None] * shrink[:, None, None] + radius[:, None, None] * circle
-        return _convex_hull(camera.project(points.reshape(-1, 3)))
+        pixels = camera.project(points.reshape(-1, 3))
+        # found in float32, good to 1e-4 px in a picture of 640 px; returned as they were
+        corners = require("cv2").convexHull(pixels.astype(np.float32), returnPoints=False)
+        return pixels[corners.ravel()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +101,6 @@ class PlacedCard:
 
     card: Card
     pose: Array
-
-    @property
-    def faces_camera(self) -> bool:
-        """True where its printed side can be seen: ``n . c < 0``."""
-        return bool(self.pose[:3, 2] @ self.pose[:3, 3] < 0)
 
     @property
     def outline(self) -> Array:
@@ -133,10 +133,3 @@ class CardScene:
         centre = outline.mean(axis=0)
         radius = 1.2 * np.linalg.norm(outline - centre, axis=1).max()
         return replace(self, bodies=(*self.bodies, ConvexBody(centre[None], np.array([radius]), shade=70)))
-
-
-def _convex_hull(points: Array) -> Array:
-    """Corners of the convex hull of points ``(n, 2)`` [px], counter-clockwise for u to the right, v up."""
-    # found in float32, good to 1e-4 px in a picture of 640 px; returned as they were
-    corners = require("cv2").convexHull(points.astype(np.float32), returnPoints=False)
-    return points[corners.ravel()]

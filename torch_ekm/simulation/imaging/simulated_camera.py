@@ -102,7 +102,8 @@ class SimulatedCamera:
     ) -> None:
         cv2, s, camera = require("cv2"), _SAMPLES, self.camera
         outline = placed.outline
-        cosine = abs(placed.pose[:3, 2] @ placed.pose[:3, 3]) / np.linalg.norm(placed.pose[:3, 3])
+        away = placed.pose[:3, 2] @ placed.pose[:3, 3]  # n . c: below 0 its printed side can be seen
+        cosine = abs(away) / np.linalg.norm(placed.pose[:3, 3])
         if np.any(outline[:, 2] < 1e-3) or cosine < _EDGE_ON:
             return
         corners = self.camera.project(outline)
@@ -132,8 +133,10 @@ class SimulatedCamera:
                 )
         quality = self.quality
         light = 0.7 + 0.3 * cosine
-        if placed.faces_camera:
-            texture = self._texture(placed.card)
+        if away < 0:
+            if placed.card not in self._textures:
+                self._textures[placed.card] = placed.card.texture()
+            texture = self._textures[placed.card]
             n_y, n_x = texture.shape
             tx = (X / width + 0.5) * n_x - 0.5
             ty = (0.5 - Y / height) * n_y - 0.5
@@ -147,8 +150,3 @@ class SimulatedCamera:
         patch = image[v0:v1, u0:u1]
         patch *= 1 - alpha
         patch += colour
-
-    def _texture(self, card: Card) -> NDArray[np.uint8]:
-        if card not in self._textures:
-            self._textures[card] = card.texture()
-        return self._textures[card]

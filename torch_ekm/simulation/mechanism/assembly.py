@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 
 import numpy as np
@@ -81,6 +82,7 @@ def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Tra
         free = [joint for joint in chain(hand, pad.link) if not coupled[joint]]
         play[draw.choice(free or [0])] = p.joint_play if free else 0.0
     losses = CableLosses(p.cable_friction, p.hysteresis, p.tendon_coupling, play)
-    transmission = Transmission(true_hand(hand, p), p.tendon_creep, shape, losses)
+    law = copy.deepcopy(p.joint_law)
+    transmission = Transmission(true_hand(hand, p), p.tendon_creep, shape, losses, law)
     transmission.lengthen(p.tendon_elongation)
     return transmission

@@ -28,15 +28,6 @@ class JointShape:
     stiffening: float
     """s [1/rad^2]."""
 
-    @property
-    def largest_arm(self) -> Array:
-        """Largest factor on each joint's moment arms ``(n_q,)``."""
-        return 1 + np.abs(self.variation)
-
-    def largest_spring_factor(self, farthest: Array) -> Array:
-        """Largest ``d(x + s x^3)/dx`` up to ``farthest`` from the rest ``(n_q,)``."""
-        return np.maximum(1.0, 1 + 3 * self.stiffening * farthest**2)
-
     @functools.cached_property
     def _round(self) -> bool:
         return not self.variation.any()
@@ -77,16 +68,6 @@ class CableLosses:
     coupling: float
     play: Array
     """Full width of each joint ``(n_q,)`` [rad]."""
-
-    @functools.cached_property
-    def any_play(self) -> bool:
-        """Some joint has play."""
-        return bool(self.play.any())
-
-    @property
-    def steepening(self) -> float:
-        """Bound of ``dT/ds`` in units of k."""
-        return 1 / (1 - self.coupling) + (self.hysteresis > 0)
 
     def compliance(self, stiffness: Array) -> Array:
         """``K^-1`` ``(n_a, n_a)`` [rad/(N m)] of actuators with stiffness k ``(n_a,)`` [N m/rad]."""

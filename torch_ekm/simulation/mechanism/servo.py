@@ -83,10 +83,6 @@ class Servo:
             stops.append(at)
         return np.reshape(stops, delta.shape)
 
-    def stay(self) -> None:
-        """Stop where the motors are."""
-        self.setpoint = self.encoder
-
     def move_to(self, motor: Array) -> Array:
         """Turn the motors to ``motor``; returns where the tendons are then fixed (after the play)."""
         self.encoder = np.array(motor, dtype=np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -53,9 +53,17 @@ class Transmission:
         creep: how fast a loaded tendon lengthens for good [rad/(N m s)].
         shape: of pulleys and springs.
         losses: of cables and joints.
+        law: torques that it adds at the joints, of their angles and of the actuators' torques.
     """
 
-    def __init__(self, hand: HandDescription, creep: float, shape: JointShape, losses: CableLosses) -> None:
+    def __init__(
+        self,
+        hand: HandDescription,
+        creep: float,
+        shape: JointShape,
+        losses: CableLosses,
+        law: Callable[[Array, Array], Array] | None = None,
+    ) -> None:
         stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
         limits = hand.joint_lower, hand.joint_upper
         self.n_a, self.n_q = hand.n_a, hand.n_q
@@ -74,10 +82,10 @@ class Transmission:
         self._pulls_only = np.concatenate(
             [[actuator.tendon for actuator in hand.actuators], np.zeros(len(coupling), bool)]
         ).astype(bool)
-        self._any_tendon = bool(self._pulls_only.any())
+        self._any_tendon, self._any_play = bool(self._pulls_only.any()), bool(losses.play.any())
         self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
         self.friction = hand.joint_friction
-        self.shape, self.losses = shape, losses
+        self.shape, self.losses, self.law = shape, losses, law
         self._followed = (self.J_a - self._lead) @ shape.excursion(self.spring_rest)
         self._apart = self._M[self.n_a :] @ self.spring_rest
         rubs = (self.friction > 0) | ((self.losses.capstan > 0) & self._lead.any(axis=0))
@@ -90,13 +98,13 @@ class Transmission:
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
         self._compliance = self.losses.compliance(stiffness)
         steep = self._k.copy()
-        steep[: self.n_a] *= self.losses.steepening
+        steep[: self.n_a] *= 1 / (1 - losses.coupling) + (losses.hysteresis > 0)  # bound of dT/ds
         size = np.abs(np.concatenate([self._lead * varied, self._M[self.n_a :], *(arms for _, arms in tied)]))
         steep = np.concatenate([steep, *(k for k, _ in tied)])
         carried = (steep * size.sum(axis=1)) @ size if self.stiff else steep @ size**2
         farthest = np.maximum(hand.joint_upper - self.spring_rest, self.spring_rest - hand.joint_lower)
-        springs = self.spring_stiffness * self.shape.largest_spring_factor(farthest)
-        self._turned = springs + carried * self.shape.largest_arm**2
+        springs = self.spring_stiffness * np.maximum(1.0, 1 + 3 * shape.stiffening * farthest**2)
+        self._turned = springs + carried * (1 + np.abs(shape.variation)) ** 2
         self.drive_stiffness = self._turned + self._k_f
         """Stiffness of each joint's drive ``(n_q,)`` [N m/rad], while all tendons are taut."""
         self.relax(self.spring_rest)
@@ -205,11 +213,13 @@ class Transmission:
         along = force @ self._M if self._lengths is None else self._along(self._lengths, inner, force)
         cables = self.shape.arm(inner) * along
         torque = cables - self.spring_torque(inner)
+        if self.law is not None:
+            torque = torque + self.law(inner, force[: self.n_a])
         if self._loops is not None:
             excursion = self.shape.excursion(inner)
             away = self._k_l * self._loops.gap(excursion)
             torque = torque - self.shape.arm(inner) * (away @ self._loops.lengths.jacobian(excursion))
-        if self.losses.any_play:
+        if self._any_play:
             whole = torque + self._turned * self._lean
             half = self.losses.play / 2
             self._lean = np.clip(whole / self._turned, -half, half)
@@ -260,18 +270,14 @@ class Transmission:
 
 def coupled_posture(coupling: Array) -> Array:
     """``S`` with ``C S = 0``: the last joint of each coupling follows, the others lead ``(n_q, n_q)``."""
-    n_k, n_q = coupling.shape
-    rows = np.array(coupling, dtype=np.float64)
-    posture = np.eye(n_q)
-    following: list[tuple[int, int]] = []
-    for k in range(n_k):
-        joint = int(np.flatnonzero(np.abs(rows[k]) > 1e-12)[-1])
-        rows[k] /= rows[k, joint]
-        for other in range(n_k):
-            if other != k:
-                rows[other] -= rows[other, joint] * rows[k]
-        following.append((k, joint))
-    for k, joint in following:
-        posture[joint] = -rows[k]
-        posture[joint, joint] = 0.0
+    rows, following = np.array(coupling, dtype=np.float64), []
+    for k, row in enumerate(rows):
+        joint = int(np.flatnonzero(np.abs(row) > 1e-12)[-1])
+        row /= row[joint]
+        share = np.where(np.arange(len(rows)) == k, 0.0, rows[:, joint])
+        rows -= np.outer(share, row)
+        following.append(joint)
+    posture = np.eye(rows.shape[1])
+    posture[following] = -rows
+    posture[following, following] = 0.0
     return posture

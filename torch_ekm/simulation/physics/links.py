@@ -92,5 +92,16 @@ def principal(inertia: Array) -> tuple[Array, Array]:
     return values, axes
 
 
+def x_axis_to(axis: Array) -> Array:
+    """A frame ``(4, 4)`` whose x axis is ``axis``: SAPIEN's joints turn about x."""
+    x = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    helper = np.eye(3)[np.argmin(np.abs(x))]
+    y = np.cross(helper, x)
+    y /= np.linalg.norm(y)
+    frame = np.eye(4)
+    frame[:3, :3] = np.column_stack([x, y, np.cross(x, y)])
+    return frame
+
+
 def _steiner(point: Array) -> Array:
     return point @ point * np.eye(3) - np.outer(point, point)

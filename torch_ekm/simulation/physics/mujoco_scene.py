@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -47,9 +48,9 @@ class MujocoScene:
         option.impratio, option.noslip_iterations, option.tolerance = 1000.0, 20, 1e-10  # else contacts creep
         link_of = self._add_hand(spec, hand)
         shapes = self._add_object(spec, hand, obj)
-        for geom in link_of:
-            for shape in shapes:
-                self._add_pair(spec, geom, shape)
+        solref, solimp = [_STIFF_TIME * time_step, 1.0], [_IMPEDANCE, _IMPEDANCE, 0.001, 0.5, 2.0]
+        for one, other in itertools.product(link_of, shapes):
+            spec.add_pair(geomname1=one, geomname2=other, condim=3, solref=solref, solimp=solimp)
         self._model: Any = spec.compile()
         self._data: Any = self._mj.MjData(self._model)
         self._arrange(hand, link_of, shapes)
@@ -115,15 +116,6 @@ class MujocoScene:
             name=name, type=kind, size=size, pos=at[:3, 3], quat=quaternion, contype=0, conaffinity=0
         )
 
-    def _add_pair(self, spec: Any, first: str, second: str) -> None:
-        spec.add_pair(
-            geomname1=first,
-            geomname2=second,
-            condim=3,
-            solref=[_STIFF_TIME * self.time_step, 1.0],
-            solimp=[_IMPEDANCE, _IMPEDANCE, 0.001, 0.5, 2.0],
-        )
-
     def _set_mass(self, body: Any, mass: float, com: Array, inertia: Array) -> None:
         values, axes = principal(inertia)
         body.explicitinertial, body.mass, body.ipos = True, mass, com
@@ -141,7 +133,6 @@ class MujocoScene:
         self._links = {model.geom(geom).id: name for geom, name in link_of.items()}
         self._object_geoms = {model.geom(name).id for name in shapes}
         self._held: Array | None = None
-        self._opposed = np.zeros(model.npair, dtype=bool)
 
     def _soften(self, stiffness: float) -> None:
         """A contact at rest carries ``f = k_ref r / (d (1 - d) A)``, A its inverse mass as MuJoCo has it."""
@@ -165,12 +156,10 @@ class MujocoScene:
         self._mj.mj_setConst(model, self._data)
         self.restore(before)
 
-    def oppose(self, links: set[str]) -> None:
-        for k, pair in enumerate(zip(self._model.pair_geom1, self._model.pair_geom2, strict=True)):
-            self._opposed[k] |= any(self._links.get(geom) in links for geom in pair)
-
-    def set_friction(self, friction: float, opposed: float) -> None:
-        self._model.pair_friction[:, :2] = np.where(self._opposed, opposed, friction)[:, None]
+    def set_friction(self, friction: float, opposed: float, links: set[str]) -> None:
+        pairs = zip(self._model.pair_geom1, self._model.pair_geom2, strict=True)
+        at_them = [any(self._links.get(geom) in links for geom in pair) for pair in pairs]
+        self._model.pair_friction[:, :2] = np.where(at_them, opposed, friction)[:, None]
 
     def set_link_weight(self, pulls: bool) -> None:
         self._model.body_gravcomp[1:] = 0.0 if pulls else 1.0
@@ -186,11 +175,6 @@ class MujocoScene:
     def q(self) -> Array:
         return self._data.qpos[self._q]
 
-    @q.setter
-    def q(self, value: Array) -> None:
-        self._data.qpos[self._q] = value
-        self._data.qvel[self._v] = 0.0
-
     @property
     def next_q(self) -> Array:
         return self.q + self.time_step * self._data.qvel[self._v]
@@ -200,9 +184,15 @@ class MujocoScene:
         self._mj.mj_kinematics(self._model, self._data)
         return self._data.xpos[self._body].copy(), self._data.xmat[self._body].reshape(3, 3).copy()
 
-    @object_pose.setter
-    def object_pose(self, pose: tuple[Array, Array]) -> None:
-        (position, rotation), data, model = pose, self._data, self._model
+    @property
+    def object_speed(self) -> tuple[float, float]:
+        speed = self._data.qvel[self._dofs]
+        count = 3 if self._normal is None else 2
+        return float(np.linalg.norm(speed[:count])), float(np.linalg.norm(speed[count:]))
+
+    def place(self, q: Array, position: Array, rotation: Array) -> None:
+        data, model = self._data, self._model
+        data.qpos[self._q], data.qvel[self._v] = q, 0.0
         quaternion = self._quaternion(rotation)
         if self._normal is None:
             data.qpos[self._at : self._at + 7] = [*position, *quaternion]
@@ -214,12 +204,6 @@ class MujocoScene:
             model.body_pos[self._body], model.body_quat[self._body] = position, quaternion
             data.qpos[self._at :] = 0.0
         data.qvel[self._dofs] = 0.0
-
-    @property
-    def object_speed(self) -> tuple[float, float]:
-        speed = self._data.qvel[self._dofs]
-        count = 3 if self._normal is None else 2
-        return float(np.linalg.norm(speed[:count])), float(np.linalg.norm(speed[count:]))
 
     def hold_object(self, held: bool) -> None:
         self._model.dof_armature[self._dofs] = _FIXED if held else 0.0

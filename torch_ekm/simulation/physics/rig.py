@@ -60,16 +60,16 @@ class Rig:
         self.fingers = 0
         """How many fingers touched the object in these steps, with any of their links."""
         self._finger_of = {link: joints[-1] for link in hand.link_names if (joints := chain(hand, link))}
+        thumb, _ = opposing_pads(hand, config)
+        pad = next(pad.link for pad in hand.pads if pad.name == thumb)
+        finger = self._finger_of.get(pad)  # None: a part of the palm
+        self._opposing = {pad} | {link for link, root in self._finger_of.items() if root == finger}
         self._build()
 
     def _build(self) -> None:
         p = self.parameters
         obj, step = true_object(self.obj, p), self.config.time_step
         self.scene = make_scene(self.engine, self.hand, obj, step, p.contact_stiffness)
-        thumb, _ = opposing_pads(self.hand, self.config)
-        pad = next(pad.link for pad in self.hand.pads if pad.name == thumb)
-        finger = self._finger_of.get(pad)  # None: a part of the palm
-        self.scene.oppose({pad} | {link for link, root in self._finger_of.items() if root == finger})
         self._set_friction()
         self.scene.set_link_weight(p.link_weight)
         self._built_scale = p.object_scale
@@ -83,8 +83,7 @@ class Rig:
         self.transmission = make_transmission(self.hand, self.parameters)
         self._build()
         scene, transmission, step = self.scene, self.transmission, self.config.time_step
-        scene.q = plan.q
-        scene.object_pose = (plan.position, plan.rotation)
+        scene.place(plan.q, plan.position, plan.rotation)
         scene.hold_object(True)
         transmission.relax(plan.q)
         slack = transmission.offset + transmission.length(plan.q)
@@ -111,7 +110,7 @@ class Rig:
                 self.run(n, lambda part: start + (done + part * n / steps) * (goal - start))  # noqa: B023
                 left -= n
                 if frame and self.to_frame == self._period and not frame():
-                    self.servo.stay()
+                    self.servo.setpoint = self.servo.encoder
                     return
 
     @property
@@ -123,10 +122,6 @@ class Rig:
     def to_frame(self) -> int:
         """Steps to the camera's next frame, at least 1: it runs by the clock, whatever the hand does."""
         return self._period - round(self.time / self.config.time_step) % self._period
-
-    def wait_for_frame(self) -> None:
-        """Let time pass until the camera's next frame."""
-        self.wait(self.to_frame * self.config.time_step)
 
     @property
     def state(self) -> TimedState:
@@ -202,7 +197,7 @@ class Rig:
         sides = [friction, (1 - p.friction_unevenness) * friction]
         if np.random.default_rng([p.hardware_seed, 3]).random() < 0.5:
             sides.reverse()
-        self.scene.set_friction(sides[0], sides[1])
+        self.scene.set_friction(sides[0], sides[1], self._opposing)
 
     def snapshot(self) -> tuple[bytes, dict[str, Any]]:
         """All that changes, for :meth:`restore`: of the physics, and of the rest by name."""
@@ -220,7 +215,8 @@ class Rig:
 _CHANGING = ("transmission", "servo", "normal", "fingers", "time")
 _TRANSMISSION = (
     "moment_arm", "spring", "servo_stiffness", "joint_friction", "tendon_creep", "arm_variation", "arm_phase",
-    "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "hardware_seed",
+    "spring_stiffening", "cable_friction", "hysteresis", "tendon_coupling", "joint_play", "joint_law",
+    "hardware_seed",
 )  # fmt: skip
 
 

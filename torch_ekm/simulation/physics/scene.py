@@ -25,9 +25,6 @@ class Scene(Protocol):
         """Joint angles in the hand's order ``(n_q,)`` [rad]."""
         ...
 
-    @q.setter
-    def q(self, value: Array) -> None: ...
-
     @property
     def next_q(self) -> Array:
         """Joint angles after the next step, if they keep their speed ``(n_q,)`` [rad]."""
@@ -35,25 +32,23 @@ class Scene(Protocol):
 
     @property
     def object_pose(self) -> tuple[Array, Array]:
-        """The object frame in the hand frame: ``(3,)`` [m] and an orthogonal ``(3, 3)``."""
+        """The object frame in the hand frame: ``(3,)`` [m] and ``(3, 3)``, orthogonal to float64."""
         ...
-
-    @object_pose.setter
-    def object_pose(self, pose: tuple[Array, Array]) -> None: ...
 
     @property
     def object_speed(self) -> tuple[float, float]:
         """Linear [m/s] and angular speed [rad/s] of the object, norms."""
         ...
 
+    def place(self, q: Array, position: Array, rotation: Array) -> None:
+        """Put hand and object there, at rest."""
+
     def set_object(self, obj: ObjectDescription) -> None:
         """Mass, centre of mass and inertia; the shapes stay."""
 
-    def oppose(self, links: set[str]) -> None:
-        """These links are of the finger that opposes the others."""
-
-    def set_friction(self, friction: float, opposed: float) -> None:
-        """Coefficients of the object's two sides, the second at the finger that opposes the others."""
+    def set_friction(self, friction: float, opposed: float, links: set[str]) -> None:
+        """Coefficients of the object's two sides, the second at ``links``, of the finger that opposes the
+        others: the same ones at each call."""
 
     def set_link_weight(self, pulls: bool) -> None:
         """Whether gravity pulls at the links too; without, only at the object."""
