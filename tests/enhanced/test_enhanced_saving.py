@@ -163,7 +163,7 @@ def hostile_values(value):
         yield torch.full_like(value, -7)
 
 
-@pytest.mark.parametrize("name", ["sogp", "learns", "mixture", "network"])
+@pytest.mark.parametrize("name", ["sogp", "learns", "mixture"])
 def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     """Each of its entries in turn is a hostile one."""
     make = LEARNERS[name]
