@@ -177,7 +177,8 @@ class EnhancedModel(Recorded, nn.Module):
         return nominal
 
     def expect(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Expected:
-        """A motion whose increment is measured some motions later, see :meth:`ResidualLearner.expect`."""
+        """A motion whose increment is measured some motions later, see
+        :meth:`~torch_ekm.residual.ResidualLearner.expect`."""
         return self.learner.expect(self.features(state, action))
 
     @torch.no_grad()

@@ -13,7 +13,7 @@ from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32, SquaredExponential
 from .mixture import MixtureResidual
 from .mixture_engine import warm_up
-from .report import UpdateEvent, UpdateReport
+from .report import Expected, UpdateEvent, UpdateReport
 from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
@@ -28,6 +28,7 @@ __all__ = [
     "DeepKernel",
     "DeepKernelSOGP",
     "DetectChanges",
+    "Expected",
     "ForgettingFactor",
     "Kernel",
     "LearnHyperparameters",

@@ -171,7 +171,7 @@ class ResidualLearner(Recorded, Predictions):
     def step(self, x: Tensor, y: Tensor, mask: Tensor | None, *said: Any) -> UpdateReport:
         """Take in one checked sample per model of ``mask``, as :meth:`update` does after its checks.
 
-        ``said`` is that of :class:`Expected`, where there is any.
+        ``said`` is that of :class:`~torch_ekm.residual.Expected`, where there is any.
         """
         x, y = x.to(self._kept), y.to(self._kept)
         if mask is not None and not mask.is_cuda and not bool(mask.any()):
