@@ -37,7 +37,6 @@ from torch_ekm.experiments.reporting.plots import save_figure
 from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.residual import (
     DeepKernelSOGP,
-    RandomFeatureRLS,
     RecursiveLeastSquares,
     ResidualLearner,
     SparseOnlineGP,
@@ -52,7 +51,6 @@ LEARNERS: dict[str, Make] = {
     "SparseOnlineGP": SparseOnlineGP,
     "DeepKernelSOGP": DeepKernelSOGP,
     "RecursiveLeastSquares": RecursiveLeastSquares,
-    "RandomFeatureRLS": RandomFeatureRLS,
 }
 
 

@@ -25,7 +25,6 @@ from torch_ekm.residual import (
     Matern32,
     MixtureResidual,
     RecursiveLeastSquares,
-    ReplayMLP,
     RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
@@ -50,7 +49,6 @@ LEARNERS = {
     "deep": lambda: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), seed=3, parts=[Standardize()]),
     "learns": lambda: sogp(parts=[ForgettingFactor(0.9), LearnHyperparameters(memory=20)], refresh_every=8),
     "mixture": lambda: MixtureResidual([sogp(), RecursiveLeastSquares(3, 2)], levels=(0.0, 0.1)),
-    "network": lambda: ReplayMLP(3, 2, hidden=(8,), members=2),
     "single": lambda: sogp(dtype=torch.float32),
 }
 
@@ -165,7 +163,7 @@ def hostile_values(value):
         yield torch.full_like(value, -7)
 
 
-@pytest.mark.parametrize("name", ["sogp", "learns", "mixture", "network"])
+@pytest.mark.parametrize("name", ["sogp", "learns", "mixture"])
 def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     """Each of its entries in turn is a hostile one."""
     make = LEARNERS[name]

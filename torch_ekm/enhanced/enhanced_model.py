@@ -14,8 +14,9 @@ from .._checks import check_finite, check_kind, check_shape
 from .._recorded import Recorded, check_state, describe
 from ..exceptions import ParameterError, ShapeError
 from ..kinematics import GraspState
-from ..residual.base import ResidualLearner, UpdateReport
+from ..residual.base import ResidualLearner
 from ..residual.kernels.action_linear import ActionLinearKernel
+from ..residual.report import Expected, UpdateReport
 from ..typing import Float, Tensor
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
@@ -175,6 +176,11 @@ class EnhancedModel(Recorded, nn.Module):
         self._check_width("f(state, action)", nominal)
         return nominal
 
+    def expect(self, state: Any, action: Float[Tensor, "*batch n_a"]) -> Expected:
+        """A motion whose increment is measured some motions later, see
+        :meth:`~torch_ekm.residual.ResidualLearner.expect`."""
+        return self.learner.expect(self.features(state, action))
+
     @torch.no_grad()
     def update(
         self,
@@ -182,6 +188,7 @@ class EnhancedModel(Recorded, nn.Module):
         action: Float[Tensor, "*batch n_a"],
         increment: Float[Tensor, "*batch n_s"],
         nominal: Float[Tensor, "*batch n_s"] | None = None,
+        expected: Expected | None = None,
     ) -> UpdateReport:
         """Train on one motion: ``y = ds - f(s, da)`` (eq. 9).
 
@@ -191,6 +198,7 @@ class EnhancedModel(Recorded, nn.Module):
             increment: what happened, ``ds``.
             nominal: ``f(s, da)`` if it is known already. None: it is computed, by a model that adapts
                 (:class:`AdaptiveModel`, a KM with figures) after it has learned from the motion.
+            expected: what :meth:`expect` gave of this state and action, where ``ds`` comes late.
 
         Returns:
             The learner's report.
@@ -219,7 +227,7 @@ class EnhancedModel(Recorded, nn.Module):
             ):  # fmt: skip
                 check_finite(name, value)
         residual = self._gather(increment - predicted) * self.output_scale
-        return self.learner.update(x, residual)
+        return self.learner.update(x if expected is None else expected, residual)
 
     def new_sequence(self) -> None:
         """The next motion does not follow on the last one: a learner that carries its last error over (a

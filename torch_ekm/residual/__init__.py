@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from .base import ResidualLearner
-from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
-from .baselines.replay_mlp import ReplayMLP
+from .baselines.linear import RecursiveLeastSquares
 from .baselines.zero import ZeroResidual
 from .default import default_learner
 from .kernels.action_linear import ActionLinearKernel
@@ -14,7 +13,7 @@ from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32, SquaredExponential
 from .mixture import MixtureResidual
 from .mixture_engine import warm_up
-from .report import UpdateEvent, UpdateReport
+from .report import Expected, UpdateEvent, UpdateReport
 from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
@@ -29,6 +28,7 @@ __all__ = [
     "DeepKernel",
     "DeepKernelSOGP",
     "DetectChanges",
+    "Expected",
     "ForgettingFactor",
     "Kernel",
     "LearnHyperparameters",
@@ -37,9 +37,7 @@ __all__ = [
     "MixtureResidual",
     "Part",
     "ProcessNoise",
-    "RandomFeatureRLS",
     "RecursiveLeastSquares",
-    "ReplayMLP",
     "ResidualLearner",
     "RobustWeight",
     "SparseOnlineGP",

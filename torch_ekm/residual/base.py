@@ -20,7 +20,7 @@ from ..typing import Bool, Float, Tensor
 from . import processes
 from .derivatives import recordable
 from .predictions import Predictions
-from .report import UpdateReport
+from .report import Expected, UpdateReport
 
 #: times the largest |y| that was learned, beyond which no prediction goes
 FARTHEST = 2.0
@@ -101,9 +101,24 @@ class ResidualLearner(Recorded, Predictions):
     # -- learning -----------------------------------------------------------------------------
 
     @torch.no_grad()
+    def expect(self, x: Float[Tensor, "*batch in_features"]) -> Expected:
+        """An input per model whose target comes some samples late, for :meth:`update` in place of x.
+
+        ``sooner = g.expect(x)``, other updates, ``g.update(sooner, y)``: a learner that judges itself by how
+        well it predicts is judged by what it says of y now, not by what later samples have taught it.
+
+        Raises:
+            ShapeError: x is not ``(*batch_shape, in)``.
+        """
+        x = self._cast(x).detach()
+        if x.shape != (*self.batch_shape, self.in_features):
+            raise ShapeError("x", str((*self.batch_shape, self.in_features)), x.shape, "one sample per model")
+        return Expected(x.clone(), None)
+
+    @torch.no_grad()
     def update(
         self,
-        x: Float[Tensor, "*time_and_batch in_features"],
+        x: Float[Tensor, "*time_and_batch in_features"] | Expected,
         y: Float[Tensor, "*time_and_batch out_features"],
         mask: Bool[Tensor, "*time_and_batch"] | None = None,
     ) -> UpdateReport:
@@ -114,7 +129,7 @@ class ResidualLearner(Recorded, Predictions):
         none at that step. (On a GPU, where looking would mean waiting, a step without samples counts too.)
 
         Args:
-            x: inputs ``(*batch_shape, in)`` or ``(n, *batch_shape, in)``.
+            x: inputs ``(*batch_shape, in)`` or ``(n, *batch_shape, in)``; or what :meth:`expect` gave.
             y: targets, the same with ``out``; the axis of a single output may be left out.
             mask: models that have a sample, ``(*batch_shape)`` or ``(n, *batch_shape)``; all if None.
 
@@ -125,14 +140,15 @@ class ResidualLearner(Recorded, Predictions):
             NonFiniteError: NaN, infinity or a number whose square is infinite in an unmasked sample,
                 under ``on_invalid="raise"``; a block is refused as a whole. The state is untouched.
         """
+        x, said = x if isinstance(x, Expected) else (x, None)
         with self.lock:
-            report = self.at_once(x, y, None) if mask is None else None
+            report = self.at_once(x, y, None) if mask is None and said is None else None
             if report is None:
                 with torch.inference_mode(False):  # some learn by autograd
-                    report = self._update(x, y, mask)
+                    report = self._update(x, y, mask, said)
             return report
 
-    def _update(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def _update(self, x: Tensor, y: Tensor, mask: Tensor | None, said: Any) -> UpdateReport:
         if self._like.is_inference():  # torch refuses to change these later on
             raise StateError("the learner was made within torch.inference_mode(); make it outside")
         x, y = self._cast(x).detach(), self._cast(y, "y").detach()
@@ -148,19 +164,22 @@ class ResidualLearner(Recorded, Predictions):
         if mask is not None:  # a NaN times zero is a NaN: clear what must not be used
             x, y = x.where(mask[..., None], 0.0), y.where(mask[..., None], 0.0)
         if not time:
-            return self.step(x, y, mask)
+            return self.step(x, y, mask) if said is None else self.step(x, y, mask, said)
         masks = [None] * len(x) if mask is None else mask.unbind()
         return UpdateReport.stack([self.step(*sample) for sample in zip(x, y, masks, strict=True)])
 
-    def step(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        """Take in one checked sample per model of ``mask``, as :meth:`update` does after its checks."""
+    def step(self, x: Tensor, y: Tensor, mask: Tensor | None, *said: Any) -> UpdateReport:
+        """Take in one checked sample per model of ``mask``, as :meth:`update` does after its checks.
+
+        ``said`` is that of :class:`~torch_ekm.residual.Expected`, where there is any.
+        """
         x, y = x.to(self._kept), y.to(self._kept)
         if mask is not None and not mask.is_cuda and not bool(mask.any()):
             return UpdateReport.of_nothing(mask, self.dtype)
         size = y.abs() if mask is None else y.abs() * mask.unsqueeze(-1)
         torch.maximum(self.largest, size, out=self.largest)
-        report = self.at_once(x, y, mask)
-        return self.absorb(x, y, mask) if report is None else report
+        report = None if said else self.at_once(x, y, mask)
+        return self.absorb(x, y, mask, *said) if report is None else report
 
     def at_once(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
         """All that an update does, checks included, by compiled loops; None: they do not take it."""

@@ -17,7 +17,7 @@ from .base import ResidualLearner
 from .local_noise import LocalNoise
 from .mixture_engine import CompiledMixture
 from .mixture_queries import MixtureQueries
-from .report import UpdateReport
+from .report import Expected, UpdateReport
 from .returns import Returns
 from .sparse_gp.monitor import COOL, DetectChanges
 from .sparse_gp.part import Host
@@ -167,9 +167,16 @@ class MixtureResidual(MixtureQueries):
         return self._engine.learn(self, x, y, mask)
 
     @torch.no_grad()
-    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
+    def expect(self, x: Tensor) -> Expected:
+        x = super().expect(x).x
+        return Expected(x, ([one.moments(x, observation=True) for one in self.members], self.carried))
+
+    @torch.no_grad()
+    def absorb(
+        self, x: Tensor, y: Tensor, mask: Tensor | None, sooner: tuple[list, Tensor] | None = None
+    ) -> UpdateReport:
         moments = [learner.moments(x, observation=True) for learner in self.members]
-        nis, *said = self._judged(x, y, mask, moments)
+        nis, *said = self._judged(x, y, mask, moments, sooner)
         reports = [learner.step(x, y, mask) for learner in self.members]
         if self.returns is not None and (mask is None or bool(mask)):
             figures = y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis), self.has_changed()
@@ -204,23 +211,36 @@ class MixtureResidual(MixtureQueries):
     # -- pieces ---------------------------------------------------------------------------------
 
     def _judged(
-        self, x: Tensor, y: Tensor, mask: Tensor | None, moments: Sequence[tuple[Tensor, Tensor]]
+        self,
+        x: Tensor,
+        y: Tensor,
+        mask: Tensor | None,
+        moments: Sequence[tuple[Tensor, Tensor]],
+        sooner: tuple[list, Tensor] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Evidence, what is carried over, variance and tails after one sample per model.
+
+        Args:
+            moments: of the learners.
+            sooner: what they and the experts said when x was expected: that is judged.
 
         Returns:
             The nis, and of the law before: its mean and typical deviation.
         """
         mean, deviation, means = self._together(moments)
+        experts = said = self._means(means)
+        if sooner is not None:
+            _, deviation, then = self._together(sooner[0])
+            said = self._of_learners(then) + sooner[1]
+            mean = self.bounded((self.beliefs * said).sum(-1))
         deviation = deviation * self.noise.log_factor(x).exp().to(deviation)
         # what is carried over is cut by a scale in which outliers have little say; what experts are judged by
         # heeds the few large samples of a stream that mostly rests, too
         typical = self.tails.typical()
         judged_by = typical * (E.RMS_LEAST * self.inflation.sqrt() / typical).clamp(1.0, E.RMS_MOST)
-        innovation = y.unsqueeze(-1) - self._means(means)
         scale = (deviation * typical).unsqueeze(-1)
-        far = _bounded(innovation / scale)
-        r = (far * (typical / judged_by).unsqueeze(-1)).square()
+        far, judged_far = (_bounded((y.unsqueeze(-1) - each) / scale) for each in (experts, said))
+        r = (judged_far * (typical / judged_by).unsqueeze(-1)).square()
         evidence = MEMORY * self.evidence - 0.5 * (E.FREEDOM + 1.0) * torch.log1p(r / E.FREEDOM)
         evidence = (evidence - evidence.amax(-1, keepdim=True)).clamp_min(E.LEAST)
         innovation = scale * far / (1.0 + (far / self._experts[4]).square())

@@ -45,7 +45,7 @@ class CompiledMixture:
 
     def __init__(self) -> None:
         self._bound: Bound | None = None
-        self._plans: list[Any] = []  # one Plan for each learner, or None
+        self._plans: list[Plan] = []  # one for each learner
 
     def __deepcopy__(self, memo: dict) -> CompiledMixture:
         return CompiledMixture()
@@ -102,15 +102,16 @@ class CompiledMixture:
         if g.dtype != torch.float64 or load_loops() is None:
             return None
         if self._bound is None or not self._bound.is_current():
-            self._bound = self._bind(g)
-            self._learners = [*g.members, g.noise.gp]
-        plans = [*map(_plan, self._learners)]
-        if plans != self._plans:
-            self._plans = plans
-            self._members = np.stack([plan.row for plan in plans if plan is not None])
-        return self._bound if self._bound.usable and None not in plans else None
+            self._bound, self._learners = None, [*g.members, g.noise.gp]
+            plans = [plan for plan in map(_plan, self._learners) if plan is not None]
+            if len(plans) < len(self._learners):
+                return None
+            self._bound, self._plans = self._bind(g, plans), plans
+            self._members = np.stack([plan.row for plan in plans])
+        usable = self._bound.usable and all(plan.follows() for plan in self._plans)
+        return self._bound if usable else None
 
-    def _bind(self, g: Any) -> Bound:
+    def _bind(self, g: Any, plans: list[Plan]) -> Bound:
         bound, tails = Bound(), g.tails
         at_zero = StudentT(tails.freedoms).log_prob(torch.zeros_like(tails.freedoms))
         fields = {
@@ -122,7 +123,8 @@ class CompiledMixture:
             G.TAIL_EVIDENCE: tails.evidence, G.NOISE_EVIDENCE: g.noise.evidence,
             G.NOISE_SHARES: g.noise.shares,
         }  # fmt: skip
-        bound.watch((g, tails, g.noise), g._modules, g.learners._modules, g.noise._modules)
+        own = g._modules, g.learners._modules, g.noise._modules
+        bound.watch((g, tails, g.noise), *own, others=plans)
         bound.usable = all(
             t.is_cpu and t.is_contiguous() and t.dtype == torch.float64 for t in fields.values()
         )

@@ -174,7 +174,11 @@ class MixtureQueries(ResidualLearner):
         return variances.where(variances.isfinite(), self.largest.square().unsqueeze(-1).to(variances))
 
     def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
-        return self.shares * (means @ self.owner.mT) + self.carried
+        return self._of_learners(means) + self.carried
+
+    def _of_learners(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:
+        """What experts take of them."""
+        return self.shares * (means @ self.owner.mT)
 
     def _apart(self, means: Tensor, mean: Tensor) -> Float[Tensor, "*any out learners shares"]:
         """How far the experts of each learner and share are from the mixture's mean, in their mean."""

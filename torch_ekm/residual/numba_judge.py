@@ -112,8 +112,10 @@ def _weigh(g, o, scale, far, p):
         level[e] = E.LEVEL_DECAY * level[e] + rho[e] * w[e]
     for e in range(n):
         level[e] += trend[e]
-        if not abs(level[e]) <= E.FARTHEST * scale:
-            level[e] = trend[e] = 0.0
+    for e in range(n):  # what is farther off is of a time when y was another size
+        trend[e] = trend[e] if abs(level[e]) <= E.FARTHEST * scale else 0.0
+    for e in range(n):
+        level[e] = level[e] if abs(level[e]) <= E.FARTHEST * scale else 0.0
     most = -np.inf
     for e in range(n):
         p[e] = prior[e] + evidence[e]
@@ -123,9 +125,13 @@ def _weigh(g, o, scale, far, p):
         p[e] = exp(p[e] - most)
 
 
-@njit(types.void(I1, INT, INT, A1), **INNER)
-def _settle(g, o, n_learners, p):
-    """What queries need of the experts, from weights p that do not sum to 1 yet, see ``_settle``."""
+@njit(types.void(I1, INT, INT, A1, A1), **INNER)
+def _settle(g, o, n_learners, p, carried):
+    """What queries need of the experts, from weights p that do not sum to 1 yet, see ``_settle``.
+
+    ``carried``: room for what each carries over. Each group is a view: an index that does not begin at 0 may
+    be negative for all that the compiler knows, and it does not vectorise.
+    """
     n, n_shares, total = g[G.N_EXPERTS], g[G.N_SHARES], 0.0
     n_groups = n_learners * n_shares
     each, experts = n // n_groups, matrix_at(g[G.EXPERTS], 0, 5, n)
@@ -136,20 +142,23 @@ def _settle(g, o, n_learners, p):
     shift = vector_at(g[G.SHIFT], o, n_groups)
     for e in range(n):
         total += p[e]
+    for e in range(n):
+        carried[e] = level[e] - kappa[e] * w[e]
     gain[:] = 0.0
     offset[0] = 0.0
     for k in range(n_groups):
-        held, carried, apart = 0.0, 0.0, 0.0
-        for e in range(k * each, (k + 1) * each):
-            held += p[e]
-        for e in range(k * each, (k + 1) * each):
-            carried += p[e] * (level[e] - kappa[e] * w[e])
-        middle = carried / max(held, TINY)
-        for e in range(k * each, (k + 1) * each):
-            apart += p[e] * (level[e] - kappa[e] * w[e] - middle) ** 2
+        own, values = p[k * each : (k + 1) * each], carried[k * each : (k + 1) * each]
+        held, sum_, apart = 0.0, 0.0, 0.0
+        for e in range(each):
+            held += own[e]
+        for e in range(each):
+            sum_ += own[e] * values[e]
+        middle = sum_ / max(held, TINY)
+        for e in range(each):
+            apart += own[e] * (values[e] - middle) ** 2
         mass[k], shift[k], spread[k] = held / total, middle, apart / total
         gain[k // n_shares] += held / total * h[k * each]
-        offset[0] += carried / total
+        offset[0] += sum_ / total
 
 
 @njit(F(I1, INT, A1), **INNER)
@@ -204,8 +213,11 @@ def judge(g, o, y, judged, since, means, noisy, far, p, local, said):
         width = min(max(E.RMS_LEAST * math.sqrt(inflation[0]) / typical, 1.0), E.RMS_MOST)
         w, level = vector_at(g[G.INNOVATION], o, n), vector_at(g[G.LEVEL], o, n)
         for i in range(n_learners):
-            for e in range(i * each, (i + 1) * each):
-                far[e] = h[e] * means[i] - kappa[e] * w[e]
+            to, share = far[i * each : (i + 1) * each], h[i * each : (i + 1) * each]
+            for e in range(each):
+                to[e] = share[e] * means[i]
+        for e in range(n):
+            far[e] -= kappa[e] * w[e]
         for e in range(n):
             far[e] = (y - (far[e] + level[e])) / scale
         by = 1.0 / (E.FREEDOM * width * width)
@@ -214,7 +226,7 @@ def judge(g, o, y, judged, since, means, noisy, far, p, local, said):
         for e in range(n):
             p[e] = far[e] * far[e] * by
         _weigh(g, o, scale, far, p)
-        _settle(g, o, n_learners, p)
+        _settle(g, o, n_learners, p, far)
         square = min(z * z, E.SQUARE_MOST * inflation[0])
         rate = max(1.0 / (since + 2.0), E.RATE)
         inflation[0] = max(inflation[0] + rate * (square - inflation[0]), 1e-12)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -75,3 +75,10 @@ class MomentsWithJacobians(NamedTuple):
     variance: Float[Tensor, "*any out"]
     mean_jacobian: Float[Tensor, "*any out in"]
     variance_jacobian: Float[Tensor, "*any out in"]
+
+
+class Expected(NamedTuple):
+    """An input whose target comes late: what :meth:`~torch_ekm.residual.ResidualLearner.expect` gives."""
+
+    x: Float[Tensor, "*batch in"]
+    said: Any  #: what the learner said then of its target, None where that does not matter

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from operator import is_
 from typing import Any
@@ -47,13 +47,18 @@ class Bound:
         self._moved: list[Tensor] = []
 
     def watch(
-        self, modules: Iterable[nn.Module], *owners: dict[str, Any], moved: Iterable[Tensor] = ()
+        self,
+        modules: Iterable[nn.Module],
+        *owners: dict[str, Any],
+        moved: Iterable[Tensor] = (),
+        others: Sequence[Bound] = (),
     ) -> None:
-        """What these hold must stay the same objects, and ``moved`` at their addresses."""
+        """What these hold must stay the same objects, and ``moved`` at their addresses; as of ``others``."""
         own = [dicts for one in modules for dicts in (one._parameters, one._buffers)]
-        self._owners = [one for one in (*own, *owners) if one]
+        theirs = (owner for other in others for owner in other._owners)
+        self._owners = [one for one in (*own, *owners, *theirs) if one]
         self._values = list(chain.from_iterable(map(dict.values, self._owners)))
-        self._moved = list(moved)  # by an assignment to .data
+        self._moved = [*moved, *(t for other in others for t in other._moved)]  # by an assignment to .data
         self._addresses = [t.data_ptr() for t in self._moved]
 
     def is_current(self) -> bool:
@@ -86,7 +91,10 @@ class Plan(Bound):
         fields = self._fields(gp)
         tensors = [value for value in fields.values() if isinstance(value, Tensor)]
         self.parameters = tuple(gp.kernel.hyperparameters().values())
-        self.watch(gp.modules(), gp._modules, moved=(*self.parameters, gp.log_noise_variance))
+        used = set(map(id, (*tensors, *self.parameters)))
+        owners = (one for one in gp.modules() if not used.isdisjoint(map(id, one.buffers(recurse=False))))
+        own = *owners, *(one for one in gp.kernel.modules() if one._parameters)
+        self.watch(own, gp._modules, moved=(*self.parameters, gp.log_noise_variance))
         self.reason = _reason(gp, [*tensors, *self.parameters])
         self.usable = not self.reason
         if not self.usable:
@@ -144,13 +152,19 @@ class Plan(Bound):
             self.learning.act(gp)
         gp.count_sample()
 
-    def follow(self) -> None:
-        """Embed the basis again where torch changed it, or the kernel: loops leave no mark on a tensor."""
+    def follows(self) -> bool:
+        """Embed the basis again where torch changed it, or the kernel: loops leave no mark on a tensor.
+
+        False: a gradient is to be carried, which loops cannot.
+        """
+        if torch.is_grad_enabled() and any(p.requires_grad for p in self.parameters):
+            return False
         marks = [t._version for t in (self._basis, *self.parameters)]
         if marks != self._marks:
             loops: Any = load_loops()
             loops.embed_fleet(self.row)
             self._marks = marks
+        return True
 
 
 def _reason(gp: Host, tensors: list[Tensor]) -> str:

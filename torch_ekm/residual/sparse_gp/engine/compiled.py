@@ -112,10 +112,7 @@ class CompiledEngine:
                 self._told = True
                 warn(_LEFT.format(type(gp).__name__, plan.reason), SpeedWarning)
             return None
-        if torch.is_grad_enabled() and any(p.requires_grad for p in plan.parameters):
-            return None
-        plan.follow()
-        return plan
+        return plan if plan.follows() else None
 
 
 def is_plain_one(x: Any, shape: tuple[int, ...]) -> bool:
