@@ -71,8 +71,9 @@ state, action = torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.f
 for learner in (
     SparseOnlineGP(in_features=4, out_features=2, parts=[Standardize(), LearnHyperparameters()]),
     torch_ekm.RecursiveLeastSquares(4, 2),
-    torch_ekm.MixtureResidual(torch_ekm.RecursiveLeastSquares(4, 2)),
+    torch_ekm.MixtureResidual(torch_ekm.residual.RandomFeatureRLS(4, 2)),
     torch_ekm.DeepKernelSOGP(4, 2),
+    torch_ekm.residual.ReplayMLP(4, 2),
 ):
     ekm = EnhancedModel(lambda s, a: s + a, learner)
     for _ in range(40):

@@ -37,6 +37,7 @@ from torch_ekm.experiments.reporting.plots import save_figure
 from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.residual import (
     DeepKernelSOGP,
+    RandomFeatureRLS,
     RecursiveLeastSquares,
     ResidualLearner,
     SparseOnlineGP,
@@ -51,6 +52,7 @@ LEARNERS: dict[str, Make] = {
     "SparseOnlineGP": SparseOnlineGP,
     "DeepKernelSOGP": DeepKernelSOGP,
     "RecursiveLeastSquares": RecursiveLeastSquares,
+    "RandomFeatureRLS": RandomFeatureRLS,
 }
 
 

@@ -23,7 +23,9 @@ from torch_ekm.residual import (
     LinearKernel,
     MixtureResidual,
     ProcessNoise,
+    RandomFeatureRLS,
     RecursiveLeastSquares,
+    ReplayMLP,
     ResidualLearner,
     SparseOnlineGP,
     ZeroResidual,
@@ -47,6 +49,8 @@ LEARNERS: dict[str, Callable[[int], ResidualLearner]] = {
     "RecursiveLeastSquares": lambda b: RecursiveLeastSquares(IN, OUT),
     "RLS, forgetting": lambda b: RecursiveLeastSquares(IN, OUT, forgetting_factor=0.98, robust=3.0),
     "RLS, as given": lambda b: RecursiveLeastSquares(IN, OUT, standardize=False),
+    "RandomFeatureRLS": lambda b: RandomFeatureRLS(IN, OUT, n_frequencies=b),
+    "ReplayMLP": lambda b: ReplayMLP(IN, OUT, hidden=(b,)),
     "mixture": lambda b: MixtureResidual(
         [SparseOnlineGP(IN, OUT, capacity=b), RecursiveLeastSquares(IN, OUT)]
     ),

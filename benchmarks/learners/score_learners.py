@@ -14,8 +14,6 @@ from typing import Any
 
 import torch
 from gpytorch_svgp import GPyTorchSVGP
-from river.compat import convert_sklearn_to_river
-from sklearn.neural_network import MLPRegressor
 
 from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.recordings import load_recording, load_t42
@@ -37,8 +35,6 @@ def in_mixture(make: Factory) -> Factory:
     return lambda d, m: MixtureResidual(make(d, m))
 
 
-# a step for each sample
-_NETWORK = convert_sklearn_to_river(MLPRegressor(hidden_layer_sizes=(64, 64), random_state=0))
 _LOUD: dict[str, Any] = {"noise_variance": 0.3}
 _WANDERING: dict[str, Any] = {"robust": 3.0, **_LOUD}
 _WANDERS = ProcessNoise(0.003)
@@ -50,8 +46,9 @@ _ALONE: dict[str, Factory] = {
     "SOGP, wanders, adapts": chosen("SOGP plain", parts=[_WANDERS, LearnHyperparameters()], **_WANDERING),
     "deep SOGP, wanders": chosen("SOGP deep", parts=[_WANDERS], **_LOUD),
     "RLS, forgets": chosen("linear RLS", **_LOUD),
+    "random features, forgets": chosen("random features", **_LOUD),
+    "ensemble of four networks": chosen("MLP ensemble", members=4),
     "river, adaptive random forest": chosen("river forest"),
-    "scikit-learn, network": chosen("river forest", model=_NETWORK),
 }
 HAND = {
     "model alone": chosen("model alone"),
@@ -62,6 +59,7 @@ _STILL: dict[str, Any] = {"forgetting_factor": 1.0, "robust": None}
 STREAMS: dict[str, Factory] = {
     "model alone": chosen("model alone"),
     "RLS": chosen("linear RLS", **_STILL),
+    "random features, 2 x 100": chosen("random features", **_STILL),
     "SOGP 100": chosen("SOGP plain"),
     "SOGP 100, adaptation": chosen("SOGP plain", parts=[LearnHyperparameters()]),
     "SOGP 300, adaptation": chosen("SOGP plain", capacity=300, parts=[LearnHyperparameters()]),
@@ -69,7 +67,7 @@ STREAMS: dict[str, Factory] = {
     "deep SOGP 300": chosen("SOGP deep", parts=(), robust=None, capacity=300),
     "GPyTorch SVGP 100": GPyTorchSVGP,
     "river, adaptive random forest": chosen("river forest"),
-    "scikit-learn, network": chosen("river forest", model=_NETWORK),
+    "ensemble of four networks, all replayed": chosen("MLP ensemble", members=4, memory=10_000),
 }
 
 

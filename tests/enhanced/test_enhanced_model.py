@@ -23,6 +23,7 @@ from torch_ekm.residual import (
     ActionLinearKernel,
     MixtureResidual,
     RecursiveLeastSquares,
+    ReplayMLP,
     SparseOnlineGP,
 )
 
@@ -218,9 +219,7 @@ def test_a_model_without_derivative_is_refused_and_differences_help(f, generator
 
 
 @pytest.mark.parametrize("context", [torch.no_grad, torch.inference_mode])
-@pytest.mark.parametrize(
-    "make", [lambda: SparseOnlineGP(N_S + N_A, 3), lambda: RecursiveLeastSquares(N_S + N_A, 3)]
-)
+@pytest.mark.parametrize("make", [lambda: SparseOnlineGP(N_S + N_A, 3), lambda: ReplayMLP(N_S + N_A, 3)])
 def test_control_loops_need_no_autograd(context, make, generator: torch.Generator) -> None:
     ekm = train(EnhancedModel(model, make()), generator, 20)
     state, action = (one[0] for one in sample(generator))

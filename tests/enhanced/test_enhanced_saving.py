@@ -25,6 +25,7 @@ from torch_ekm.residual import (
     Matern32,
     MixtureResidual,
     RecursiveLeastSquares,
+    ReplayMLP,
     RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
@@ -49,6 +50,7 @@ LEARNERS = {
     "deep": lambda: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), seed=3, parts=[Standardize()]),
     "learns": lambda: sogp(parts=[ForgettingFactor(0.9), LearnHyperparameters(memory=20)], refresh_every=8),
     "mixture": lambda: MixtureResidual([sogp(), RecursiveLeastSquares(3, 2)], levels=(0.0, 0.1)),
+    "network": lambda: ReplayMLP(3, 2, hidden=(8,), members=2),
     "single": lambda: sogp(dtype=torch.float32),
 }
 

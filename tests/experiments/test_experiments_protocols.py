@@ -110,8 +110,8 @@ def test_every_object_is_asked_for_shares_of_its_end() -> None:
 def test_every_learner_for_a_hand_starts_at_zero_and_learns() -> None:
     generator = torch.Generator().manual_seed(0)
     slope = torch.randn(4, 6, generator=generator, dtype=torch.float64)
-    names = ("action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS")
-    for name in (*names, "model alone"):
+    names = ("action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features")
+    for name in (*names, "MLP", "model alone"):
         learner = make_learner(name, 5, 4, 30)
         x = torch.randn(120, 9, generator=generator, dtype=torch.float64)
         y = x[:, 5:] @ slope

@@ -9,12 +9,13 @@ import pytest
 import torch
 
 from torch_ekm import RecursiveLeastSquares, SparseOnlineGP, default_learner
-from torch_ekm.residual import DeepKernelSOGP, MixtureResidual
+from torch_ekm.residual import DeepKernelSOGP, MixtureResidual, RandomFeatureRLS
 
 MAKE = {
     "sogp": SparseOnlineGP,
     "deep": DeepKernelSOGP,
     "rls": RecursiveLeastSquares,
+    "features": RandomFeatureRLS,
     "mixture": lambda d, m: MixtureResidual([SparseOnlineGP(d, m)]),
     "default": default_learner,
 }

@@ -20,7 +20,9 @@ from torch_ekm.residual import (
     LearnHyperparameters,
     MixtureResidual,
     ProcessNoise,
+    RandomFeatureRLS,
     RecursiveLeastSquares,
+    ReplayMLP,
     RobustWeight,
     SparseOnlineGP,
     SquaredExponential,
@@ -117,6 +119,7 @@ def test_a_query_may_ask_all_models_of_a_fleet(shape):
     fleets = [
         ZeroResidual(3, 2, batch_shape=(5,)),
         RecursiveLeastSquares(3, 2, batch_shape=(5,)),
+        RandomFeatureRLS(3, 2, n_frequencies=9, batch_shape=(5,)),
         sogp(3, 2, capacity=6, batch_shape=(5,)),
         deep_sogp(3, 2, capacity=6, hidden=(4,), features=2, batch_shape=(5,)),
         MixtureResidual(sogp(3, 2, capacity=6, batch_shape=(5,))),
@@ -201,6 +204,9 @@ def test_no_action_is_not_novel():
         (SparseOnlineGP, {"kernel": SquaredExponential(3, batch_shape=(2,))}),
         (SparseOnlineGP, {"refresh_every": "often"}),
         (DeepKernelSOGP, {"hidden": 8}),
+        (RandomFeatureRLS, {"lengthscale": 0.0}),
+        (RandomFeatureRLS, {"lengthscale": float("nan")}),
+        (RandomFeatureRLS, {"lengthscale": [1.0, 2.0]}),
     ],
 )
 def test_parameters_that_cannot_be_are_named(kind, options):
@@ -293,6 +299,12 @@ def test_masks_may_be_lists_of_bools_only():
 def test_arguments_of_another_kind_are_named(make: Callable[[], object], named: str) -> None:
     with pytest.raises(ParameterError, match=named):
         make()
+
+
+def test_a_seed_may_be_a_time() -> None:
+    learner = ReplayMLP(1, 1, seed=2**60, hidden=(4,), members=1)
+    learner.update(torch.zeros(1), torch.ones(1))
+    assert int(learner.count) == 1
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 12, 32, 40])

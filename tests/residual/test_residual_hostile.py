@@ -17,7 +17,9 @@ from torch_ekm.residual import (
     LinearKernel,
     Matern32,
     MixtureResidual,
+    RandomFeatureRLS,
     RecursiveLeastSquares,
+    ReplayMLP,
     SparseOnlineGP,
     SquaredExponential,
     Standardize,
@@ -62,7 +64,7 @@ def test_an_input_that_stood_still_begins_to_move(name, jitter):
 
 @pytest.mark.parametrize(
     "make",
-    [SparseOnlineGP, RecursiveLeastSquares, default_learner],
+    [SparseOnlineGP, RecursiveLeastSquares, RandomFeatureRLS, ReplayMLP, default_learner],
     ids=lambda make: make.__name__,
 )
 def test_where_y_shrinks_by_a_thousand_what_was_learned_is_let_go(make):
@@ -148,14 +150,17 @@ def test_slope_deviations_are_those_of_differences(kernel):
         torch.testing.assert_close(found[0, j], expected, rtol=2e-2, atol=1e-3)
 
 
-def test_slope_deviations_of_least_squares_are_those_of_differences():
-    learner = RecursiveLeastSquares(4, 2)
+@pytest.mark.parametrize(
+    "make", [RecursiveLeastSquares, lambda d, m: RandomFeatureRLS(d, m, n_frequencies=30)]
+)
+def test_slope_deviations_of_linear_learners_are_those_of_differences(make):
+    learner = make(4, 2)
     x, y = Hostile(7, 60, 1e-2, 1e3, 5.0, 0.0, ()).samples()
     learner.update(x, y)
     h, point = 1e-5, x[3]
     for j in range(4):
         step = h * torch.eye(4, dtype=torch.float64)[j]
-        z = learner.units.input(torch.stack([point + step, point - step]))
+        z = learner._inputs(torch.stack([point + step, point - step]))
         phi = learner.features(z)
         difference = (phi[0] - phi[1]) / (2 * h)
         expected = (difference @ learner.covariance @ difference).sqrt() * learner.units.output.scale
@@ -172,7 +177,7 @@ def test_a_slope_by_an_input_that_never_moved_is_within_what_is_stated_of_it():
     assert float(slope[..., 3].abs().max()) > 1e3
     assert bool((slope[..., 3].abs() < 3.0 * deviation[..., 3]).all())
     assert float(deviation[..., :3].max()) < 2.0
-    assert bool(ZeroResidual(4, 2).slope_deviation(x[0]).isnan().all())
+    assert bool(ReplayMLP(4, 2).slope_deviation(x[0]).isnan().all())
 
 
 def test_a_mixture_s_slopes_are_apart_by_what_its_learners_disagree():
@@ -192,7 +197,7 @@ def test_a_mixture_s_slopes_are_apart_by_what_its_learners_disagree():
 # -- scales that are known ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares])
+@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares, RandomFeatureRLS])
 def test_what_lies_below_the_resolution_is_no_input(make):
     x, y = Hostile(0, 120, 1.0, 1.0, 0.0, 0.0, ()).samples()
     x[:, 3] *= 1e-6

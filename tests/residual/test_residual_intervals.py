@@ -7,14 +7,15 @@ import torch
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.residual import (
-    RecursiveLeastSquares,
+    RandomFeatureRLS,
+    ReplayMLP,
     ResidualLearner,
     SparseOnlineGP,
     ZeroResidual,
     default_learner,
 )
 
-KINDS = [ZeroResidual, RecursiveLeastSquares, SparseOnlineGP, default_learner]
+KINDS = [ZeroResidual, RandomFeatureRLS, ReplayMLP, SparseOnlineGP, default_learner]
 
 
 def learned(make, n: int = 60) -> tuple[ResidualLearner, torch.Tensor]:
@@ -106,7 +107,7 @@ def test_each_query_of_a_draw_has_the_predicted_law(make, observation):
 
 
 @pytest.mark.parametrize("fleet", [(), (2,)])
-@pytest.mark.parametrize("make", [RecursiveLeastSquares, SparseOnlineGP, default_learner])
+@pytest.mark.parametrize("make", [RandomFeatureRLS, SparseOnlineGP, default_learner])
 def test_a_draw_is_one_function_of_all_queries(make, fleet):
     learner, x = make(2, 2, batch_shape=fleet), learned(ZeroResidual)[1]
     for x_t, y_t in zip(x, torch.sin(x), strict=True):

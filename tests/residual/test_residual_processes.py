@@ -14,6 +14,7 @@ from torch_ekm.residual import (
     LinearKernel,
     MixtureResidual,
     RecursiveLeastSquares,
+    ReplayMLP,
     SparseOnlineGP,
     default_learner,
 )
@@ -76,14 +77,14 @@ def test_a_fork_while_another_thread_updates_goes_on():
     learner.update(x[0], x[0, :1])
 
 
-@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares])
+@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares, ReplayMLP])
 def test_an_optimiser_finds_nothing_to_move_and_says_so(make):
     """Only the learner moves its hyperparameters: an optimiser would leave its caches stale."""
     with pytest.raises(ValueError, match="empty parameter list"):
         torch.optim.Adam(make(2, 1).parameters())
 
 
-@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares])
+@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares, ReplayMLP])
 def test_the_axis_of_a_single_output_may_be_left_out(make):
     learner, x = learned(make)
     other = make(2, 1)

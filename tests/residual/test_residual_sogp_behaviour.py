@@ -19,7 +19,9 @@ from torch_ekm.residual import (
     DetectChanges,
     ForgettingFactor,
     ProcessNoise,
+    RandomFeatureRLS,
     RecursiveLeastSquares,
+    ReplayMLP,
     RobustWeight,
     SquaredExponential,
     Standardize,
@@ -270,3 +272,21 @@ def test_rls_forgetting_is_weighted_ridge():
     phi, w = np.hstack([x.numpy(), np.ones((40, 1))]), 0.9 ** np.arange(40, 0, -1)
     P = np.linalg.inv((phi.T * w) @ phi / 0.2 + np.eye(5))
     np.testing.assert_allclose(rls.weights.numpy(), P @ (phi.T * w) @ y.numpy() / 0.2, atol=1e-9)
+
+
+def test_random_features_approach_the_gp():
+    x, y = system(16, 80)
+    kernel = SquaredExponential(4)
+    gp = sogp(4, 2, capacity=80, kernel=kernel, novelty_threshold=0.0)
+    rff = RandomFeatureRLS(4, 2, n_frequencies=300, noise_variance=0.01, **AS_GIVEN)
+    gp.update(x, y)
+    rff.update(x, y)
+    assert float((gp(x) - rff(x)).square().mean().sqrt()) < 0.05
+
+
+def test_networks_learn_too():
+    x, y = system(19, 400)
+    learner = ReplayMLP(4, 2)
+    learner.update(x, y)
+    xs, ys = system(20, 200, noise=0.0)
+    assert float((learner(xs) - ys).square().mean()) < 0.3 * float(ys.square().mean())

@@ -9,7 +9,9 @@ import torch
 
 from torch_ekm.residual import (
     DeepKernelSOGP,
+    RandomFeatureRLS,
     RecursiveLeastSquares,
+    ReplayMLP,
     SparseOnlineGP,
     Standardize,
     default_learner,
@@ -22,10 +24,12 @@ SMALL = {
     "deep": lambda **o: DeepKernelSOGP(3, 2, capacity=30, hidden=(8,), features=2, **o),
     "default": lambda **o: default_learner(3, 2, capacity=20, **o),
     "rls": lambda **o: RecursiveLeastSquares(3, 2, **o),
+    "rff": lambda **o: RandomFeatureRLS(3, 2, n_frequencies=30, **o),
+    "mlp": lambda **o: ReplayMLP(3, 2, hidden=(16,), members=2, **o),
 }
 EVERY = pytest.mark.parametrize("make", SMALL.values(), ids=SMALL)
-#: Their g can take the shape of what is learned here: a linear one cannot.
-FLEXIBLE = pytest.mark.parametrize("make", [SMALL[name] for name in ("sogp", "deep", "default")])
+#: Their g can take the shape of what is learned here: a linear one cannot, and a network is slow.
+FLEXIBLE = pytest.mark.parametrize("make", [SMALL[name] for name in ("sogp", "deep", "default", "rff")])
 
 
 def stream(n: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -110,7 +114,7 @@ def test_least_squares_in_single_precision_far_from_the_origin():
     assert float((far - y)[:, 1].square().mean().sqrt() / y[:, 1].square().mean().sqrt()) < 0.3
 
 
-@pytest.mark.parametrize("kind", ["sogp", "deep", "default", "rls"])
+@pytest.mark.parametrize("kind", ["sogp", "deep", "default", "rls", "rff"])
 def test_an_offset_of_the_outputs(kind):
     """Far from all samples the prediction is the mean of y, whose size does not matter."""
     x, y = stream(150)

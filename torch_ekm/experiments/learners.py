@@ -97,6 +97,9 @@ LEARNERS: dict[str, Factory] = {
     "rbf": _rbf,
     "model alone": _kind(residual.ZeroResidual),
     "linear RLS": _kind(residual.RecursiveLeastSquares, **_FRESH),
+    "random features": _kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
+    "MLP": _kind(residual.ReplayMLP, standardize=False),
+    "MLP ensemble": _kind(residual.ReplayMLP, members=3, standardize=False),
     "SOGP default": _kind(residual.SparseOnlineGP, "capacity"),
     "SOGP plain": _sparse(),  # nothing forgotten, every sample trusted
     "SOGP": _sparse(forgetting_factor=0.99, robust=3.0),
@@ -128,6 +131,7 @@ DEFAULT_LEARNER = "action-linear"
 _HAND_FIGURES: dict[str, dict[str, Any]] = {
     "SOGP deep": {"forgetting_factor": 0.995, "parts": ()},
     "linear RLS": {"forgetting_factor": 0.995, "weight_variance": 0.1},
+    "random features": {"forgetting_factor": 0.995},
     "model alone": {"noise_variance": NOISE_VARIANCE},
 }
 
@@ -148,7 +152,7 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
 
     Args:
         n_s, n_a: features of the state, actuators.
-        capacity: basis vectors; RLS has no such figure.
+        capacity: basis vectors or random frequencies; networks and RLS have no such figure.
         options: instead of the factory's own choices.
 
     Raises:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from .base import ResidualLearner
-from .baselines.linear import RecursiveLeastSquares
+from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
+from .baselines.replay_mlp import ReplayMLP
 from .baselines.zero import ZeroResidual
 from .default import default_learner
 from .kernels.action_linear import ActionLinearKernel
@@ -37,7 +38,9 @@ __all__ = [
     "MixtureResidual",
     "Part",
     "ProcessNoise",
+    "RandomFeatureRLS",
     "RecursiveLeastSquares",
+    "ReplayMLP",
     "ResidualLearner",
     "RobustWeight",
     "SparseOnlineGP",

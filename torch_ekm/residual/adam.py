@@ -18,12 +18,12 @@ class Adam(nn.Module):
 
     Args:
         parameters: what is to be moved; the same and in the same order in each step.
+        betas: b1 and b2.
     """
 
-    betas = 0.9, 0.99  #: b1 and b2
-
-    def __init__(self, parameters: Iterable[Tensor]) -> None:
+    def __init__(self, parameters: Iterable[Tensor], betas: tuple[float, float] = (0.9, 0.999)) -> None:
         super().__init__()
+        self.betas = betas
         for i, p in enumerate(parameters):
             self.register_buffer(f"first_{i}", torch.zeros_like(p.detach()))
             self.register_buffer(f"second_{i}", torch.zeros_like(p.detach()))

@@ -19,7 +19,6 @@ _BURST_CLIP = 10.0  # times as much for columns whose large samples come in comp
 _COMPANY = 0.5  # of what chance would leave alone
 _DOUBT = 2.0  # so many large ones are taken to be alone beforehand
 _REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
-_SETTLED = 0.1  # relative change of a scale (of a shift in units of it) that is not worth new units
 REACH = 10.0  #: scales beyond which z goes no further, in columns where that matters
 ALIEN = 1e-20  #: a variation below this share is no rest either: what was before was wrong
 
@@ -100,11 +99,12 @@ class RunningScale(nn.Module):
         for buffer, found in zip(pooled, _pooled(self, block, on), strict=True):
             buffer.copy_(torch.as_tensor(found))
 
-    def settle(self, *young: Tensor) -> tuple[Tensor, Tensor]:
+    def settle(self, *young: Tensor, settled: float = 0.1) -> tuple[Tensor, Tensor]:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
 
         Args:
             young: a block as of :meth:`pool` that counts, too; every change is worth new units then.
+            settled: relative change of a scale (of a shift in units of it) that is not worth new units.
         """
         found = _pooled(self, *young) if young else (self.weight, self.centre, self.spread)
         weight, centre, spread = map(torch.as_tensor, found[:3])
@@ -113,7 +113,7 @@ class RunningScale(nn.Module):
         scale = torch.where(usable, spread.maximum(self.least), self._first())
         off = torch.maximum(scale / self.scale, self.scale / scale) - 1.0
         off = off + (centre - self.shift).abs() / torch.minimum(scale, self.scale)
-        change = (weight > 0) & (off > (0.0 if young else _SETTLED))
+        change = (weight > 0) & (off > (0.0 if young else settled))
         scale, shift = torch.where(change, scale, self.scale), torch.where(change, centre, self.shift)
         offset, ratio = (self.shift - shift) / self.scale, self.scale / scale
         self.shift.copy_(shift)

@@ -1,48 +1,38 @@
-"""Bayesian linear regression, one sample at a time."""
+"""Bayesian linear regression on features, one sample at a time."""
 
 from __future__ import annotations
 
+import math
+from abc import abstractmethod
 from typing import Any
 
 import torch
 from torch import nn
-from torch.distributions import Normal
 
-from ..._checks import check_fraction, check_positive
+from ..._checks import check_count, check_fraction, check_positive
 from ...typing import Bool, Float, Tensor
-from ..base import ResidualLearner
-from ..misled import Misled
+from ..kernels.kernel import log_parameter
 from ..predictions import joint_draws
-from ..recent import Recent
 from ..report import UpdateReport
 from ..running_scale import BLOCK
-from ..sparse_gp.units import Standardize
-
-_FAR = 2.3  # logarithm of a change of units after which it starts again
-_CUT = 6.0  # largest target in its own units
+from .scaled import ScaledLearner
 
 
-class RecursiveLeastSquares(ResidualLearner):
-    """``g(x) = W' [z, 1]``: Bayesian recursive least squares with forgetting, O(d^2) a sample::
+class LinearInFeatures(ScaledLearner):
+    """``g(x) = w' phi(x)``, ``w ~ N(0, v I)``, ``y = g + noise``: exact posterior, O(f^2) a sample::
 
-        P = (A/s2 + I/v)^-1,  W = P b/s2,   A = sum lam^(t-i) phi phi',  b = sum lam^(t-i) phi y'
+        P = (A/s2 + I/v)^-1,  w = P b/s2,   A = sum lam^(t-i) phi phi',  b = sum lam^(t-i) phi y'
 
-    ``phi = [z, 1]``, z and y in units of :class:`~torch_ekm.residual.running_scale.RunningScale`, W of prior
-    N(0, v I). (A, b) is the master copy, (P, W) is carried along by rank-one steps and rebuilt every
+    (A, b) is the master copy, (P, w) is carried along by rank-one steps and rebuilt every
     ``refresh_every`` samples, when forgetting is applied: unlike the classical P/lam, directions
     without new samples go back to the prior instead of winding up.
 
-    Units are adopted after 1, 2, 4, 8, 16 samples, which are then learned again, and from 32 samples on every
-    32; after a change by a factor of ten the last 31 are learned again. Targets beyond 6 units count as 6:
-    one outlier does not spoil a learner that trusts all samples alike. A learner that errs by four times y in
-    most of sixteen samples starts again.
-
     Args:
+        n_phi: number of features f.
         noise_variance, weight_variance: s2 and v.
         forgetting_factor: lam in (0, 1], see ForgettingFactor.
         robust: c of the weight ``1 / (1 + z2/c^2)`` on a sample's noise; None: weight 1.
-        standardize: whether it learns units, or how; else x and y are taken as they are.
-        options: see ResidualLearner.
+        options: see ScaledLearner and ResidualLearner.
     """
 
     refresh_every = 16  #: samples between two rebuilds
@@ -51,12 +41,12 @@ class RecursiveLeastSquares(ResidualLearner):
         self,
         in_features: int,
         out_features: int,
+        n_phi: int,
         *,
         noise_variance: float = 0.1,
         weight_variance: float = 1.0,
         forgetting_factor: float = 1.0,
         robust: float | None = None,
-        standardize: bool | Standardize = True,
         **options: Any,
     ) -> None:
         super().__init__(in_features, out_features, **options)
@@ -64,124 +54,61 @@ class RecursiveLeastSquares(ResidualLearner):
         self.weight_variance = check_positive("weight_variance", weight_variance)
         self.forgetting_factor = check_fraction("forgetting_factor", forgetting_factor)
         self.robust = None if robust is None else check_positive("robust", robust)
-        self.standardize, self.n_samples = bool(standardize), 0
-        fleet = {"batch_shape": self.batch_shape, "dtype": self.dtype, "device": self.device}
-        units = standardize if isinstance(standardize, Standardize) else Standardize()
-        columns = [True] * self.in_features, [self.standardize] * self.in_features
-        self.units = units.units(self.in_features, self.out_features, *columns, **fleet)
-        self.recent = Recent(self.in_features, self.out_features, BLOCK, **fleet)
-        self.misled = Misled(tuple(self.batch_shape), self._kept, self.device)
-        f, zeros = self.in_features + 1, self._like.new_zeros
+        f, zeros = n_phi, self._like.new_zeros
         self.information = nn.Buffer(zeros(*self.batch_shape, f, f))
         self.target = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
-        self.covariance = nn.Buffer(zeros(*self.batch_shape, f, f))
+        prior = self.weight_variance * torch.eye(f, dtype=self.dtype, device=self.device)
+        self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
         self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         self.pending = nn.Buffer(zeros(self.batch_shape))
-        self._clear(torch.ones_like(self.pending, dtype=torch.bool))
 
-    def features(self, z: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:
-        """``[z, 1]``."""
-        return torch.cat([z, torch.ones_like(z[..., :1])], dim=-1)
+    @abstractmethod
+    def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:
+        """phi(x) of inputs in the learner's units, differentiable in x."""
 
-    # -- predictions ----------------------------------------------------------------------------
+    def _mean(self, z: Tensor) -> Tensor:
+        return (self.features(z).unsqueeze(-2) @ self.weights).squeeze(-2)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self._value(self._mean(self.units.input(self.check_query(x))))
-
-    def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
-        """Variance ``phi' P phi``, plus s2 on request; the same for all outputs but for their scales."""
-        z = self.units.input(self.check_query(x))
-        phi, mean = self.features(z).unsqueeze(-2), self._mean(z)
+    def _law(self, z: Tensor, observation: bool) -> tuple[Tensor, Tensor]:
+        """Variance ``phi' P phi``, plus s2 on request; the same for all outputs."""
+        phi = self.features(z).unsqueeze(-2)
         v = (phi @ self.covariance @ phi.mT).squeeze(-1).clamp_min(torch.finfo(phi.dtype).tiny)
-        variance = v + self.noise_variance if observation else v
-        deviation = variance.sqrt().expand_as(mean) * self.units.output.scale
-        return Normal(self._value(mean), deviation.to(self.dtype), validate_args=False)
-
-    def linearize(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        z = self.units.input(self.check_query(x))
-        slope = self.weights[..., :-1, :].mT.expand(*z.shape[:-1], -1, -1)
-        mean, slope = self.units.value(self._mean(z), 1), self.units.slope(slope, 1, z)
-        return self.bounded_slope(mean.to(self.dtype), slope.to(self.dtype))
-
-    def slope_deviation(self, x: Tensor) -> Tensor:
-        """Root of P's diagonal; the same for all outputs but for their scales."""
-        z = self.units.input(self.check_query(x))
-        variance = self.covariance.diagonal(dim1=-2, dim2=-1)[..., :-1].expand_as(z)
-        deviation = self.units.slope(variance.clamp_min(0.0).sqrt().unsqueeze(-2), 1, torch.zeros_like(z))
-        return deviation.expand(*deviation.shape[:-2], self.out_features, -1).to(self.dtype)
+        return (phi @ self.weights).squeeze(-2), v + self.noise_variance if observation else v
 
     def unit_draws(self, x: Tensor, n: int, generator: torch.Generator | None) -> Tensor:
         """From the covariance ``phi' P phi`` of the queries."""
-        z = self.units.input(x).reshape(-1, *self.batch_shape, self.in_features).movedim(0, -2)
+        z = self._inputs(x).reshape(-1, *self.batch_shape, self.in_features).movedim(0, -2)
         phi = self.features(z)
         draws = joint_draws(phi @ self.covariance @ phi.mT, n, self.out_features, generator)
         return draws.reshape(n, *x.shape[:-1], self.out_features)
 
-    def _mean(self, z: Float[Tensor, "*any in"]) -> Float[Tensor, "*any out"]:
-        """In the learner's units."""
-        return (self.features(z).unsqueeze(-2) @ self.weights).squeeze(-2)
+    @abstractmethod
+    def _feature_slopes(self, z: Tensor) -> Float[Tensor, "*any f in"]:
+        """dphi/dz."""
 
-    def _value(self, mean: Float[Tensor, "*any out"]) -> Tensor:
-        return self.bounded(self.units.value(mean, 1).to(self.dtype))
+    def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        return self._mean(z), self.weights.mT @ self._feature_slopes(z)
 
-    # -- learning -------------------------------------------------------------------------------
+    def _slope_variance(self, z: Tensor) -> Tensor:
+        """``(dphi/dz)' P dphi/dz`` by column."""
+        slopes = self._feature_slopes(z)
+        return (slopes * (self.covariance @ slopes)).sum(-2)
 
-    def reset(self) -> None:
-        """Forget all samples and the units that were found in them."""
-        for count in (self.n_refused, self.largest, self.misled.level):
-            count.zero_()
-        self.n_samples = 0
-        self._clear(torch.ones_like(self.pending, dtype=torch.bool))
-        self.units.reset()
-        self.recent.reset()
-
-    def absorb(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        if self.standardize:
-            self._observe(x, y, mask)
-        self.n_samples += 1
-        z, t = self.units.input(x), self.units.output(y)
-        self.misled.observe(t - self._mean(z), t, mask)
-        misled = self.misled.found()
-        if misled is not None:
-            self._clear(misled)
-            self.units.output.forget(misled)
-            self.recent.on.masked_fill_(misled.unsqueeze(-1), 0.0)
-        return self._learn(x, y, mask)
-
-    def _observe(self, x: Tensor, y: Tensor, mask: Tensor | None) -> None:
-        """Units, before the sample that comes is learned in them."""
-        n, units, recent = self.n_samples, self.units, self.recent
-        recent.keep(n, x, y, None if mask is None else mask.to(x.dtype))
-        if n + 1 < BLOCK and n & (n + 1) == 0:
-            x, y, on, _ = recent.last(n + 1, n + 1)
-            units.input.settle(x, on)
-            units.output.settle(y, on)
-            self._learn_block(n, torch.ones_like(self.pending, dtype=torch.bool))
-        elif (n + 1) % BLOCK == 0:
-            units.pool(recent.x, recent.y, recent.on)
-            changes = units.input.settle(), units.output.settle()
-            ratios = torch.cat([changes[0][1], changes[1][1]], dim=-1).log().abs()
-            if bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
-                self._follow(*changes)
-            far = (ratios > _FAR).any(-1)
-            if bool(far.any()):  # what was learned so far was of another order
-                self._learn_block(BLOCK - 1, far)
-
-    def _learn_block(self, n: int, models: Bool[Tensor, "*batch"]) -> None:
-        """Again, from the first n samples of the present block only."""
-        self._clear(models)
-        for i in range(n):
-            on = (self.recent.on[..., i] > 0) & models
-            if bool(on.any()):  # else it is nothing, or of a time that is forgotten
-                x, y = self.recent.x[..., i, :], self.recent.y[..., i, :]
-                self._learn(x, y, on if self.batch_shape else None)
+    def _clear(self, models: Bool[Tensor, "*batch"] | None = None) -> None:
+        """Back to w ~ N(0, v I)."""
+        models = torch.ones_like(self.pending, dtype=torch.bool) if models is None else models
+        self.pending.masked_fill_(models, 0.0)
+        models = models[..., None, None]
+        for buffer in (self.information, self.target, self.weights, self.covariance):
+            buffer.masked_fill_(models, 0.0)
+        prior = self.weight_variance * models.squeeze(-1)
+        self.covariance.diagonal(dim1=-2, dim2=-1).add_(prior)
 
     def _learn(self, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport:
-        s2, column = self.noise_variance, self.features(self.units.input(x)).unsqueeze(-1)
-        t = self.units.output(y).clamp(-_CUT, _CUT) if self.standardize else y
+        s2, column = self.noise_variance, self.features(x).unsqueeze(-1)
         Pphi = self.covariance @ column
         v = (column.mT @ Pphi).squeeze(-1).squeeze(-1)
-        innovation = t - (column.mT @ self.weights).squeeze(-2)
+        innovation = y - (column.mT @ self.weights).squeeze(-2)
         nis = innovation.square().mean(-1) / (s2 + v)
         weight = torch.ones_like(v)
         if self.robust is not None:
@@ -193,14 +120,14 @@ class RecursiveLeastSquares(ResidualLearner):
         self.covariance -= gain * (Pphi @ Pphi.mT)
         self.weights += gain * (Pphi @ innovation.unsqueeze(-2))
         self.information += share * (column @ column.mT)
-        self.target += share * (column @ t.unsqueeze(-2))
+        self.target += share * (column @ y.unsqueeze(-2))
         self.pending += 1.0 if mask is None else mask
         if self.n_samples % self.refresh_every == 0:
             self._rebuild()
         return UpdateReport.of(nis, mask, weight=weight)
 
     def _rebuild(self) -> None:
-        """Forget what is due; (P, W) from (A, b) by Cholesky in double precision."""
+        """Forget what is due; (P, w) from (A, b) by Cholesky in double precision."""
         if self.forgetting_factor < 1.0:
             factor = (self.forgetting_factor**self.pending)[..., None, None]
             self.information.mul_(factor)
@@ -217,8 +144,29 @@ class RecursiveLeastSquares(ResidualLearner):
         target = d.unsqueeze(-1) * self.target.double() / self.noise_variance
         self.weights.copy_(d.unsqueeze(-1) * torch.cholesky_solve(target, factor))
 
+
+class RecursiveLeastSquares(LinearInFeatures):
+    """``g(x) = W' [x, 1]``: Bayesian recursive least squares with forgetting.
+
+    Args:
+        options: see LinearInFeatures.
+    """
+
+    grows = True
+
+    def __init__(self, in_features: int, out_features: int, **options: Any) -> None:
+        super().__init__(in_features, out_features, in_features + 1, **options)
+
+    def features(self, x: Tensor) -> Tensor:
+        return torch.cat([x, torch.ones_like(x[..., :1])], dim=-1)
+
+    def _feature_slopes(self, z: Tensor) -> Tensor:
+        """The identity, and 0 for the constant."""
+        slopes = torch.eye(self.in_features + 1, self.in_features, dtype=z.dtype, device=z.device)
+        return slopes.expand(*z.shape[:-1], *slopes.shape)
+
     def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
-        """New units, ``new phi = T phi``: ``A <- T A T'``, ``b <- T (b + A 1 o) r``, 1 the bias' place."""
+        """``new phi = T phi``: ``A <- T A T'``, ``b <- T (b + A 1 o) r``, 1 being the bias' place."""
         (offset, ratio), (offset_t, ratio_t) = change, change_t
         T = torch.diag_embed(torch.cat([ratio, torch.ones_like(ratio[..., :1])], -1))
         T[..., :-1, -1] = offset * ratio
@@ -227,17 +175,49 @@ class RecursiveLeastSquares(ResidualLearner):
         self.target.copy_(T @ self.target * ratio_t.unsqueeze(-2))
         self._rebuild()
 
-    def _clear(self, models: Bool[Tensor, "*batch"]) -> None:
-        """These models back to W ~ N(0, v I)."""
-        self.pending.masked_fill_(models, 0.0)
-        models = models[..., None, None]
-        for buffer in (self.information, self.target, self.weights, self.covariance):
-            buffer.masked_fill_(models, 0.0)
-        self.covariance.diagonal(dim1=-2, dim2=-1).add_(self.weight_variance * models.squeeze(-1))
 
-    def get_extra_state(self) -> dict[str, Any]:
-        """Number of samples seen: the rhythm continues after a reload."""
-        return {**super().get_extra_state(), "n_samples": self.n_samples}
+class RandomFeatureRLS(LinearInFeatures):
+    """``phi(x) = sqrt(1/D) [cos(Omega x), sin(Omega x)]``: a squared exponential GP, approximately.
 
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.n_samples = int(state["n_samples"])
+    Incremental sparse-spectrum regression after Gijsberts & Metta (Neural Networks 41, 2013); the
+    frequencies Omega ~ N(0, L^-2) stay fixed.
+
+    Args:
+        n_frequencies: D; there are 2 D features.
+        lengthscale: L, one number or one per input; default sqrt(in_features).
+        seed: of the frequencies.
+        options: see LinearInFeatures.
+    """
+
+    def __init__(
+        self,
+        in_features: int,
+        out_features: int,
+        *,
+        n_frequencies: int = 100,
+        lengthscale: float | Tensor | None = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
+        n_phi = 2 * check_count("n_frequencies", n_frequencies)
+        super().__init__(in_features, out_features, n_phi, **options)
+        generator = torch.Generator().manual_seed(seed)
+        draws = torch.randn(n_frequencies, in_features, generator=generator, dtype=torch.float64)
+        lengthscale = math.sqrt(in_features) if lengthscale is None else lengthscale
+        scale = log_parameter("lengthscale", lengthscale, (self.in_features,), dtype=torch.float64).exp()
+        self.frequencies = nn.Buffer((draws / scale).to(self._like))
+
+    def features(self, x: Tensor) -> Tensor:
+        angle = x @ self.frequencies.mT
+        return torch.cat([angle.cos(), angle.sin()], dim=-1) / math.sqrt(len(self.frequencies))
+
+    settled = 1.0  # frequencies are of one unit: only a much better one is worth starting again
+
+    def _follow(self, change: tuple[Tensor, Tensor], change_t: tuple[Tensor, Tensor]) -> None:
+        """Features of other units are others: the block is learned again, but for the sample that comes."""
+        self._learn_block(BLOCK - 1)
+
+    def _feature_slopes(self, z: Tensor) -> Tensor:
+        """``dphi/dz = sqrt(1/D) [-sin(.) Omega; cos(.) Omega]``."""
+        cos, sin = self.features(z).chunk(2, dim=-1)
+        return torch.cat([-sin, cos], dim=-1).unsqueeze(-1) * self.frequencies.repeat(2, 1)

@@ -78,7 +78,7 @@ class LearnHyperparameters(Part):
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
         parameters = [*learner.kernel.hyperparameters().values(), learner.log_noise_variance]
-        self.adam = Adam(parameters)
+        self.adam = Adam(parameters, betas=(0.9, 0.99))
         for i, p in enumerate(parameters):
             self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
         # no more than what a learner remembers that forgets
