@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from contenders import Contender
 from matrix import Frame, Question, ask
-from questions import BY_HAND, SHORT
+from questions import BY_HAND
 from sessions import turns
 from simulated_hand.lens import LENSES, DistortingCamera, calibrated, lens_of
 from simulated_hand.tracking_accuracy import measure_tracking
@@ -151,6 +151,7 @@ def lens_table(trials: Frame, frames: int = 20) -> Table:
 
 
 SENSING = Question(
+    "sensing",
     "What each reading is worth",
     turns,
     READINGS,
@@ -161,12 +162,11 @@ SENSING = Question(
     ),
     split="object",
     more=(hall_table, lens_table),
-    quick=SHORT,
 )  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    ask("sensing", SENSING, arguments, __doc__)
+    ask(SENSING, arguments, __doc__)
 
 
 if __name__ == "__main__":

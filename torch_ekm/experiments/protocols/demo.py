@@ -24,23 +24,12 @@ from .generalize import Generalize
 
 @dataclass(frozen=True)
 class Demo(Generalize):
-    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and
-    with pictures.
-
-    Raises:
-        UnknownNameError: no such object; the message lists them.
-        DescriptionError: its files are missing or wrong.
-        ParameterError: an angle that is no rotation.
-    """
+    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and with pictures."""
 
     objects: tuple[str, ...] = ("box",)
     warm_up: int = 0
     controllers: tuple[str, ...] = ("KM", "E-KM")
     poses: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        load_object(self.object)
 
     @property
     def object(self) -> str:
