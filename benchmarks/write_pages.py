@@ -59,14 +59,12 @@ class Part:
         words = f"{self.command} {self.quick if quick else ''}".format(out=out, data=data).split()
         if words[0] == "torch-ekm":
             return [sys.executable, "-c", "from torch_ekm.cli import main; main()", *words[1:]]
-        if words[0] == "pytest":
-            return [sys.executable, "-m", *words]
         return [sys.executable, str(HERE / words[0]), *words[1:]]
 
     def spoken(self) -> str:
         """The command as a reader would type it."""
         words = self.command.format(out="FOLDER", data="DATA")
-        return words if words.startswith(("torch-ekm", "pytest")) else f"python benchmarks/{words}"
+        return words if words.startswith("torch-ekm") else f"python benchmarks/{words}"
 
 
 def parts_of(name: str) -> list[Part]:

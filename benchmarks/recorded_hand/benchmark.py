@@ -65,17 +65,6 @@ class RecordedHandResult:
         """Objects on which nothing was identified."""
         return [name for name in self.paths if name != APART]
 
-    def row(self, name: str, horizon: int, subset: str = "all") -> Row:
-        """One row of the results.
-
-        Raises:
-            UnknownNameError: there is none of that name at this horizon; the message lists all.
-        """
-        own = {r.name: r for r in self.rows if (r.horizon, r.subset) == (horizon, subset)}
-        if name not in own:
-            raise UnknownNameError("prediction", name, own)
-        return own[name]
-
 
 def predict_recorded_hand(
     data: str | Path | None = None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -94,15 +93,6 @@ class Stream:
         (inputs, _), (targets, unit) = units(x, True), units(y, centre)
         unit = tuple(unit.tolist()) if self.outputs else ()
         return replace(self, x=inputs, y=targets, warm_up=warm_up, available=len(self), unit=unit)
-
-    def save(self, path: Path) -> Path:
-        """Write the samples as CSV: columns ``x1..xd, y1..ym``."""
-        names = [f"x{i + 1}" for i in range(self.x.shape[1])] + [f"y{i + 1}" for i in range(self.y.shape[1])]
-        with Path(path).open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(names)
-            writer.writerows(torch.cat([self.x, self.y], dim=1).tolist())
-        return Path(path)
 
 
 def load_table(
