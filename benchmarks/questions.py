@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, WHOLE_TURNS, Contender
+from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, READINGS, WHOLE_TURNS, Contender
 from matrix import Frame, Question, bands_table, learning_picture, table
+from sensing import hall_table
 from sessions import TARGETS, directions, foresight, new_objects, there_and_back, turns
 
 from torch_ekm.experiments.config import Setting
@@ -87,6 +88,14 @@ _ASKED = (
     Question(
         "printed", "The paper's own system", turns, PRINTED, objects=tuple(TABLE_I), options=_TO_THE_END,
         columns=_FIRST, split="object",
+    ),
+    Question(
+        "sensing", "What each reading is worth", turns, READINGS, setting=_SEEN.replace(engine="mujoco"),
+        options=BY_HAND, split="object", more=(hall_table,),
+        columns=(
+            "turns", "lost", "reached", "error [deg]", "by the E-KM [deg]", "joints off by [deg]",
+            "motors off by [deg]",
+        ),
     ),
     Question(
         "oracle", "The E-KM and an oracle that knows hand, pose and forces", turns, ORACLE,

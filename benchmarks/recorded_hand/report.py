@@ -11,13 +11,13 @@ from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
 
 from .benchmark import HORIZONS, RecordedHandResult
 from .recordings import APART, STEP
-from .scores import COORDINATES, SUBSETS
+from .scores import COORDINATES
 
 
 def write_report(result: RecordedHandResult, folder: str | Path) -> Report:
     """Tables as CSV, a figure, and ``index.html`` with all of them, into ``folder``."""
     horizons = sorted(HORIZONS, reverse=True)
-    tables = [score_table(result, horizon, subset) for subset in SUBSETS for horizon in horizons]
+    tables = [score_table(result, horizon) for horizon in horizons]
     caption = (
         "Error of the position over its motion, and 95 % intervals over objects; 1: as if nothing moved."
     )
@@ -36,19 +36,19 @@ def summary(result: RecordedHandResult) -> str:
         f"{HORIZONS[-1] * STEP:g} s ahead."
     ]
     for row in result.rows:
-        if (row.horizon, row.subset) == (HORIZONS[-1], "all") and "no model" not in row.name:
+        if row.horizon == HORIZONS[-1] and "no model" not in row.name:
             said.append(f"{row.name}: x {row.ratio['x'].mean:.2f}, y {row.ratio['y'].mean:.2f}.")
     return " ".join(said)
 
 
-def score_table(result: RecordedHandResult, horizon: int, subset: str) -> Table:
-    """Every way to predict at one horizon, on some of the samples."""
-    rows = [row for row in result.rows if (row.horizon, row.subset) == (horizon, subset)]
+def score_table(result: RecordedHandResult, horizon: int) -> Table:
+    """Every way to predict at one horizon."""
+    rows = [row for row in result.rows if row.horizon == horizon and row.name != "no model"]
     cells: list[list[Cell]] = [[row.name, *(row.ratio[c] for c in COORDINATES), row.rms] for row in rows]
     columns = ["prediction", *(Column(c, ".3f") for c in COORDINATES), Column("rms", ".3f")]
     note = (
         "rms error over rms motion, both cut at their 99 % quantile, 95 % interval over objects; 1: as if "
         "nothing moved. Last: of all three coordinates in units of their spread, not cut, mean over objects."
     )
-    caption = f"{horizon * STEP:g} s ahead: {SUBSETS[subset]}"
-    return Table(f"scores_{horizon}_{subset}", caption, columns, cells, note)
+    caption = f"{horizon * STEP:g} s ahead"
+    return Table(f"scores_{horizon}", caption, columns, cells, note)

@@ -17,12 +17,11 @@ pytest.importorskip("mujoco")
 sys.path.append(str(Path(__file__).parents[1] / "experiments"))
 
 import matrix
-from contenders import BEGINNINGS, PARTS, PLANS, PRINTED, WHOLE_TURNS, MisprintedBench
+from contenders import BEGINNINGS, PARTS, PLANS, PRINTED, READINGS, WHOLE_TURNS, MisprintedBench
 from experiments_records import frame
 from hands import CONDITIONS, FAMILIES, OTHERS, STRENGTHS, hands
 from matrix import FIGURES, bands_table, pivot, verdict
 from questions import QUESTIONS
-from sensing import SENSING
 from sessions import TARGETS, Part, new_objects, target_of
 
 from torch_ekm.control.safety.on_the_way import OnTheWay
@@ -70,7 +69,7 @@ def test_every_family_has_three_strengths_that_differ_from_the_nominal_hand() ->
         hands(["arm"])
 
 
-@pytest.mark.parametrize("group", [WHOLE_TURNS, PLANS, PARTS, PRINTED, BEGINNINGS, SENSING.contenders])
+@pytest.mark.parametrize("group", [WHOLE_TURNS, PLANS, PARTS, PRINTED, BEGINNINGS, READINGS])
 def test_contenders_differ_in_what_they_are_called(group) -> None:
     made = [(one.controller, one.bench, one.setting(Setting())) for one in group.values()]
     assert len({str(one) for one in made}) == len(group)
@@ -210,7 +209,7 @@ def test_foresight_says_what_was_predicted_and_what_came(tmp_path: Path) -> None
 
 def test_tables_fit_on_a_page() -> None:
     """At most eight columns, and eight rows of contenders."""
-    for name, asked in {**QUESTIONS, "sensing": SENSING}.items():
+    for name, asked in QUESTIONS.items():
         assert len(asked.columns) <= 7, name
         assert not set(asked.columns) - set(FIGURES), name
         assert len(asked.contenders) <= 8, name

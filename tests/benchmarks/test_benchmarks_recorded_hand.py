@@ -41,8 +41,8 @@ def result(folder):
 
 
 def ratio(result, name):
-    """Five seconds ahead, on all samples."""
-    return next(row.ratio for row in result.rows if (row.name, row.horizon, row.subset) == (name, 50, "all"))
+    """Five seconds ahead."""
+    return next(row.ratio for row in result.rows if (row.name, row.horizon) == (name, 50))
 
 
 def whole(paths, part):
@@ -164,7 +164,7 @@ def test_the_page_has_its_tables_and_pictures(result, tmp_path):
     assert (tmp_path / "index.html").stat().st_size > 10_000
     assert [figure.path for figure in report.figures] == ["scores.svg"]
     names = {table.name for table in report.tables}
-    assert names == {f"scores_{h}_{s}" for h in (10, 50) for s in ("all", "first")}
+    assert names == {"scores_10", "scores_50"}
 
 
 def save(folder, key, states):

@@ -9,13 +9,12 @@ import numpy as np
 import pandas
 import pytest
 import scipy.stats
-import torch
 from experiments_records import frame, not_grasped, turn
 
 from torch_ekm.exceptions import StateError
 from torch_ekm.experiments.protocols.generalize import significance_table
 from torch_ekm.experiments.protocols.online import Online, learning, prediction_curves
-from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord, prediction_error
+from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord
 from torch_ekm.experiments.reporting.report import Column, Table
 from torch_ekm.experiments.reporting.statistics import (
     Estimate,
@@ -52,13 +51,6 @@ def test_figures_that_a_record_does_not_have_are_refused() -> None:
     del figures["off_rotation_deg"]
     with pytest.raises(StateError, match="off_rotation_deg"):
         TrialRecord.from_json(figures)
-
-
-def test_prediction_error_picks_the_focused_rows_of_the_object() -> None:
-    increment, predicted = torch.arange(26.0), torch.zeros(26)
-    focus = torch.zeros(1, 6)
-    focus[0, 3] = 1.0
-    assert prediction_error(increment, predicted, focus).tolist() == [23.0]
 
 
 def test_lost_object_counts_with_the_whole_angle() -> None:
