@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -110,15 +110,14 @@ class Question(Protocol):
             found[job] = plant, name, group, seed
         return found
 
-    def session(self, plant: str, contender: str, items: Sequence[str], seed: int) -> list[TrialRecord]:
+    def session(self, plant: str, contender: str, items: Sequence[str], seed: int) -> Iterator[TrialRecord]:
         """Each record says of which plant and contender it is, and in which part of the session."""
         one, own = self.contenders[contender], self.of(plant, contender).hardware_instance(seed)
         made = self.act(lambda item: one.bench(own, item, one.controller), items, seed, **self.options)
-        about = {"plant": plant, "contender": contender}
-        return [
-            replace(r, more={**r.more, **about, "case": f"{contender}, {r.more.get('part', '')}"})
-            for r in made
-        ]
+        for each in made:
+            case = ", ".join([contender, *filter(None, [each.more.get("part")])])
+            about = {"plant": plant, "contender": contender, "case": case}
+            yield replace(each, more={**each.more, **about})
 
     def counted(self, trials: Frame) -> Frame:
         """The turns that count."""

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -32,7 +32,7 @@ class Protocol(ABC):
         """The jobs of these seeds: name -> arguments of :meth:`session`."""
 
     @abstractmethod
-    def session(self, *arguments: Any) -> Sequence[TrialRecord]:
+    def session(self, *arguments: Any) -> Iterable[TrialRecord]:
         """Trials that belong together, one after the other; the results of different sessions are
         independent."""
 
