@@ -34,7 +34,7 @@ from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics.se3 import hat
 from torch_ekm.model import KinematicModel, Linearization
 from torch_ekm.model.stiffness.potential import posture_stiffness
-from torch_ekm.plant import Observation, PlantStatus
+from torch_ekm.plant import Observation, Plant, PlantStatus
 from torch_ekm.plant.wrapper import PlantWrapper
 from torch_ekm.simulation.mechanism.assembly import true_hand, true_object
 
@@ -112,24 +112,43 @@ class MisprintedBench(PrintedBench):
         self.model = MisprintedModel(self.hand.hand, self.hand.object, flagged)
 
 
-class Omniscient(PlantWrapper):
-    """A simulated plant whose joints, pose and fingertip forces are reported as they are."""
+class Known(PlantWrapper):
+    """A simulated plant some of whose readings are true."""
+
+    def __init__(self, plant: Plant, names: tuple[str, ...]) -> None:
+        super().__init__(plant)
+        self.names = names
 
     def observation(self, seen: Observation) -> Observation:
-        truth = seen.truth
-        if truth is None or seen.status is PlantStatus.LOST:
+        if seen.truth is None or seen.status is PlantStatus.LOST:
             return seen
-        known = {name: getattr(truth, name) for name in ("q", "position", "rotation", "fingertip_force")}
-        return dataclasses.replace(seen, **known)
+        return dataclasses.replace(seen, **{name: getattr(seen.truth, name) for name in self.names})
 
 
-class OracleBench(Bench):
+class TrueJoints(Bench):
+    """Joint angles are true."""
+
+    known: tuple[str, ...] = ("q",)
+
+    def __init__(self, *given: Any, **options: Any) -> None:
+        super().__init__(*given, **options)
+        self.plant = Known(self.plant, self.known)
+
+
+class TruePoses(TrueJoints):
+    """The object's pose is true."""
+
+    known = ("position", "rotation")
+
+
+class OracleBench(TrueJoints):
     """A bench whose model is the plant's own, and whose pose, joints and forces are the true ones."""
+
+    known = ("q", "position", "rotation", "fingertip_force")
 
     def __init__(self, setting: Setting, *given: Any, **options: Any) -> None:
         no_doubts = WholeTurn(deviations=0.0, off_rotation=StoppingRule().off_limit, force=0.0)
         super().__init__(setting.replace(planner=no_doubts), *given, **options)
-        self.plant = Omniscient(self.plant)
         plant = self.hand
         hand, obj = true_hand(plant.hand, plant.parameters), true_object(plant.object, plant.parameters)
         self.model = KinematicModel(hand, obj, self.setting.model)
@@ -137,6 +156,11 @@ class OracleBench(Bench):
 
 def _without_fingertips(base: Setting) -> dict[str, Any]:
     return {"plant": base.parameters.replace(force_sensors=False)}
+
+
+def _without_noise(base: Setting) -> dict[str, Any]:
+    exact = dict.fromkeys(("joint_noise", "position_noise", "rotation_noise"), 0.0)
+    return {"sensing": False, "plant": base.parameters.replace(**exact)}
 
 
 def _as_printed(base: Setting) -> dict[str, Any]:
@@ -217,3 +241,11 @@ BEGINNINGS = {
     "empty": Contender("E-KM", {"adapts": False}),
 }
 ORACLE = {"E-KM": Contender(), "oracle": Contender("KM+S", {}, OracleBench)}
+#: Readings replaced by the truth.
+READINGS = {
+    "all sensed": Contender(),
+    "true joint angles": Contender(bench=TrueJoints),
+    "true poses": Contender(bench=TruePoses),
+    "all true": Contender("E-KM", _without_noise),
+    "KM, all sensed": Contender("KM"),
+}

@@ -12,24 +12,25 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import pandas
 from contenders import Contender
-from hands import CONDITIONS, Hand, hands
+from hands import CONDITIONS, hands
 
 from torch_ekm._terminal import progress
 from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.config import Setting, digest, object_name
-from torch_ekm.experiments.jobs import run_jobs
+from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.experiments.reporting.trials import select, trial_frame
+from torch_ekm.experiments.reporting.trials import select
+from torch_ekm.experiments.reproduce import Experiment, run_trials, write_report
 from torch_ekm.simulation import ENGINES
 
 if TYPE_CHECKING:
@@ -42,38 +43,96 @@ _PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#
 
 
 @dataclass(frozen=True)
-class Question:
+class Question(Protocol):
     """What is asked of the matrix."""
 
+    name: str
     title: str
-    session: Callable[..., list[TrialRecord]]
+    act: Callable[..., list[TrialRecord]]
+    """What is done with one hand, controller and seed: ``act(make, items, seed, **options)``."""
     contenders: Mapping[str, Contender]
-    hands: str = "nominal"
+    hands: Sequence[str] = ("nominal",)
     """Names of :func:`hands.hands`."""
-    objects: str = "box,can"
-    engine: str = "mujoco"
+    objects: Sequence[str] = ("box", "can")
+    setting: Setting = field(default_factory=lambda: Setting(engine="mujoco"))
+    """What hands and contenders change."""
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Arguments of the session."""
+    """Of ``act``."""
     together: bool = False
     """A session has all objects, in their order; else one."""
-    setting: Mapping[str, Any] = field(default_factory=dict)
-    """Changes of every hand's setting."""
     plant: Mapping[str, Any] = field(default_factory=dict)
     """Figures of every plant."""
     by: str = "contender"
     """Column of the frame: a row of the table for each."""
     columns: tuple[str, ...] = ("turns", "lost", "reached", "motions", "error [deg]")
-    """Names of :data:`FIGURES`."""
-    kind: str = "turn"
-    """The trials that count."""
+    """Names of :data:`FIGURES`; none: the first of ``more`` is the table."""
     split: str = "plant"
     """Column of the second table, which has a row for each of its entries."""
     more: tuple[Callable[[Frame], Table], ...] = ()
     """Further tables."""
     picture: Callable[[Frame], Figure] | None = None
     """None: ends and motions of the groups of ``split``."""
-    quick: Mapping[str, Any] = field(default_factory=dict)
-    """Arguments of the session that make it short."""
+    short: Mapping[str, Any] = field(default_factory=lambda: {"angles": (4.0,), "learns_by": ()})
+    """Options that make a session short."""
+
+    def __str__(self) -> str:
+        return f"Hands: {', '.join(hands(self.hands))}"
+
+    def quick(self) -> Self:
+        """One hand and object, two contenders, true poses."""
+        return replace(
+            self,
+            hands=[*hands(self.hands)][:1],
+            objects=self.objects[: 2 if self.together else 1],
+            contenders=dict(itertools.islice(self.contenders.items(), 2)),
+            setting=self.setting.replace(sensing=False),
+            options={**self.options, **self.short},
+        )
+
+    def configuration(self) -> dict[str, Any]:
+        names = {name: list(getattr(self, name)) for name in ("hands", "objects", "contenders")}
+        return {**names, "options": self.options, "plant_changes": self.plant, **self.setting.figures()}
+
+    def of(self, plant: str, contender: str) -> Setting:
+        """How a contender meets a plant."""
+        setting = self.setting.replace(**hands([plant])[plant])
+        setting = setting.replace(plant=setting.parameters.replace(**self.plant))
+        return self.contenders[contender].setting(setting)
+
+    def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[str, str, tuple[str, ...], int]]:
+        found = {}
+        groups = [tuple(self.objects)] if self.together else [(item,) for item in self.objects]
+        for plant, seed, group, name in itertools.product(hands(self.hands), seeds, groups, self.contenders):
+            one, setting = self.contenders[name], self.of(plant, name)
+            decides = digest(setting, group, self.options, one.bench, one.controller, self.act.__name__)
+            job = "_".join([plant, *map(object_name, group), name, decides, str(seed)])
+            job = "".join(c if c.isalnum() or c in "_-.+" else "_" for c in job)
+            found[job] = plant, name, group, seed
+        return found
+
+    def session(self, plant: str, contender: str, items: Sequence[str], seed: int) -> Iterator[TrialRecord]:
+        """Each record says of which plant and contender it is, and in which part of the session."""
+        one, own = self.contenders[contender], self.of(plant, contender).hardware_instance(seed)
+        made = self.act(lambda item: one.bench(own, item, one.controller), items, seed, **self.options)
+        for each in made:
+            case = ", ".join([contender, *filter(None, [each.more.get("part")])])
+            about = {"plant": plant, "contender": contender, "case": case}
+            yield replace(each, more={**each.more, **about})
+
+    def counted(self, trials: Frame) -> Frame:
+        """The turns that count."""
+        return select(trials, kind="turn").reset_index(drop=True)
+
+    def report(self, seeds: Sequence[int], trials: Frame, folder: Path) -> Report:
+        """Tables, picture and verdict of the trials with a grasp."""
+        turns = self.counted(trials)
+        tables = [table(turns, self.by, self.columns, self.name, self.title)] if self.columns else []
+        tables += [one for make in self.more if (one := make(select(trials))).rows]
+        if turns[self.split].nunique() > 1 and self.split != self.by:
+            tables.append(pivot(turns, self.by, self.split))
+        drawn = ends_picture(turns, self.by, self.split) if self.picture is None else self.picture(turns)
+        figure = save_figure(drawn, folder, self.name, f"{self.title}: each group of turns.")
+        return Report(self.title, f"{verdict(turns, self.by)}.", tables, [figure])
 
 
 @dataclass(frozen=True)
@@ -89,13 +148,11 @@ def _reached(turns: Frame) -> Frame:
 
 
 def _mean(values: Any) -> float:
-    known = [value for value in values if value is not None and not math.isnan(value)]
-    return float(np.mean(known)) if known else math.nan
+    return float(pandas.Series(values, dtype=float).mean())
 
 
 def _median(values: Any) -> float:
-    known = [value for value in values if value is not None and not math.isnan(value)]
-    return float(np.median(known)) if known else math.nan
+    return float(pandas.Series(values, dtype=float).median())
 
 
 def early(turns: Frame, which: str) -> list[float]:
@@ -152,22 +209,6 @@ def _last(turns: Frame) -> Frame:
     """The last return of each series."""
     back = turns[(turns["part"] == "series") & turns["back"].eq(True)]
     return back.groupby(["plant", "contender", "object", "seed"]).tail(1)
-
-
-def frame_of(
-    results: Mapping[str, Sequence[Mapping[str, Any]]], keys: Mapping[str, tuple[str, str]]
-) -> Frame:
-    """A row for each trial with a grasp: its record's figures, plant and contender.
-
-    Args:
-        results: what sessions left, by job.
-        keys: plant and contender of each job.
-    """
-    found = select(trial_frame({job: map(TrialRecord.from_json, one) for job, one in results.items()}))
-    found["plant"], found["contender"] = zip(*found["job"].map(keys), strict=True)
-    if "part" in found:
-        found["case"] = found["contender"] + ", " + found["part"]
-    return found.reset_index(drop=True)
 
 
 def table(turns: Frame, by: str, columns: Sequence[str], name: str, title: str, note: str = "") -> Table:
@@ -268,88 +309,43 @@ def verdict(turns: Frame, by: str) -> str:
     return "; ".join(f"{name} {told(mine)}" for name, mine in turns.groupby(by, sort=False))
 
 
-def session(
-    make: Callable[..., Any], one: Contender, setting: Setting, items: Sequence[str], seed: int, options: Any
-) -> list[dict[str, Any]]:
-    """What one job leaves."""
-    own = one.setting(setting).hardware_instance(seed)
-    return [
-        vars(each) for each in make(lambda item: one.bench(own, item, one.controller), items, seed, **options)
-    ]
-
-
-def jobs(
-    asked: Question, found: Mapping[str, Hand], names: Sequence[str], items: Sequence[str],
-    seeds: Sequence[int], engine: str, quick: bool,
-) -> tuple[dict[str, tuple[Any, ...]], dict[str, tuple[str, str]]]:  # fmt: skip
-    """Job -> arguments of :func:`session`, and its plant and contender. A name has all that decides it."""
-    todo, keys = {}, {}
-    options = {**asked.options, **(asked.quick if quick else {})}
-    groups = [tuple(items)] if asked.together else [(item,) for item in items]
-    for plant, seed, group, name in itertools.product(found, seeds, groups, names):
-        setting = Setting(engine=engine).replace(**{**asked.setting, **found[plant]})
-        setting = setting.replace(plant=setting.parameters.replace(**asked.plant))
-        setting = setting.replace(sensing=False) if quick else setting
-        one = asked.contenders[name]
-        decides = digest(
-            one.setting(setting), group, options, one.bench, one.controller, asked.session.__name__
-        )
-        job = "_".join([plant, *map(object_name, group), name, decides, str(seed)])
-        job = "".join(c if c.isalnum() or c in "_-.+" else "_" for c in job)
-        todo[job], keys[job] = (asked.session, one, setting, group, seed, options), (plant, name)
-    return todo, keys
-
-
-def report(asked: Question, turns: Frame, folder: Path, name: str) -> Report:
-    """Tables, picture and verdict, in ``folder``."""
-    turns.to_csv(folder / "trials.csv", index=False)
-    counted = turns[turns["kind"] == asked.kind] if asked.kind else turns
-    told = verdict(counted, asked.by)
-    tables = [table(counted, asked.by, asked.columns, name, asked.title)]
-    if counted[asked.split].nunique() > 1 and asked.split != asked.by:
-        tables.append(pivot(counted, asked.by, asked.split))
-    tables += [one for make in asked.more if (one := make(turns)).rows]
-    drawn = ends_picture(counted, asked.by, asked.split) if asked.picture is None else asked.picture(counted)
-    caption = f"{asked.title}: each group of turns."
-    made = Report(asked.title, f"{told}.", tables, [save_figure(drawn, folder, name, caption)])
-    made.write(folder)
-    print(made.markdown(), told, sep="\n")
-    return made
-
-
 def _split(names: str, known: Mapping[str, Any]) -> list[str]:
     """Names separated by semicolons, or by commas where none of them has any."""
     return [names] if names in known else names.split(";" if ";" in names else ",")
 
 
-def ask(
-    name: str, asked: Question, arguments: Sequence[str] | None = None, about: str | None = __doc__
-) -> Report:
+def ask(asked: Question, arguments: Sequence[str] | None = None, about: str | None = __doc__) -> Report:
     """Run a question as the command line says, and print its report; the last line is the verdict."""
     raw = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=about, formatter_class=raw)
-    parser.add_argument("--objects", default=asked.objects, help="names or paths")
+    parser.add_argument("--objects", help=f"names or paths; {','.join(asked.objects)} if left out")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1010"), help="FIRST:END")
-    parser.add_argument(
-        "--hands", default=asked.hands, help="see hands.py; also all, strong, losing, conditions"
-    )
+    parser.add_argument("--hands", help="see hands.py; also all, strong, losing, conditions")
     parser.add_argument("--contenders", help=f"some of {'; '.join(asked.contenders)}")
-    parser.add_argument("--engine", default=asked.engine, choices=ENGINES)
+    parser.add_argument("--engine", default=asked.setting.engine, choices=ENGINES)
     parser.add_argument("--jobs", type=int, default=2, help="processes at once")
-    parser.add_argument("--out", type=Path, default=Path(f"{name}_output"), help="keeps what is finished")
+    parser.add_argument("--out", type=Path, default=Path(f"{asked.name}_output"), help="keeps what is done")
     parser.add_argument("--quick", action="store_true", help="one hand, object and seed, two contenders")
     given = parser.parse_args(arguments)
-    names = _split(given.contenders, asked.contenders) if given.contenders else list(asked.contenders)
-    if unknown := set(names) - set(asked.contenders):
-        parser.error(f"no contender {', '.join(sorted(unknown))}; there are {'; '.join(asked.contenders)}")
-    found, items, seeds = hands(_split(given.hands, CONDITIONS)), given.objects.split(","), given.seeds
+    known = asked.contenders
+    names = _split(given.contenders, known) if given.contenders else list(known)
+    if unknown := set(names) - set(known):
+        parser.error(f"no contender {', '.join(sorted(unknown))}; there are {'; '.join(known)}")
+    asked = replace(
+        asked,
+        contenders={name: known[name] for name in names},
+        hands=_split(given.hands, CONDITIONS) if given.hands else asked.hands,
+        objects=given.objects.split(",") if given.objects else asked.objects,
+        setting=asked.setting.replace(engine=given.engine),
+    )
+    planned = Experiment(asked, given.seeds)
     if given.quick:
-        found = dict(itertools.islice(found.items(), 1))
-        names, items, seeds = names[:2], items[: 2 if asked.together else 1], seeds[:1]
-    todo, keys = jobs(asked, found, names, items, seeds, given.engine, given.quick)
-    with progress("running", len(todo)) as advance:
-        results = run_jobs(session, todo, given.out, given.jobs, advance)
-    return report(asked, frame_of(results, keys), given.out, name)
+        planned = Experiment(asked.quick(), given.seeds[:1], quick=True)
+    with progress("running", len(planned.jobs)) as advance:
+        trials = run_trials(planned, given.out, given.jobs, advance)
+    made = write_report(planned, trials, given.out)
+    print(made.markdown(), verdict(asked.counted(trials), asked.by), sep="\n")
+    return made
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -364,7 +360,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.list or given.question is None:
         print(*(f"{name:16} {asked.title}" for name, asked in QUESTIONS.items()), sep="\n")
         return
-    ask(given.question, QUESTIONS[given.question], rest)
+    ask(QUESTIONS[given.question], rest)
 
 
 if __name__ == "__main__":

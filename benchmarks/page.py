@@ -20,6 +20,7 @@ PACKAGES = (
 
 _MOST_ROWS = 8  # of a table that is shown; others are CSV files
 _MOST_LINES = 24  # of printed text that is not folded
+_PICTURE = re.compile(r"!\[(.*)\]\((\w+)\.\w+\)", re.DOTALL)
 
 
 class Section(NamedTuple):
@@ -28,9 +29,11 @@ class Section(NamedTuple):
     title: str
     see: str
     body: str
-    """Markdown; a heading of the third level for each table."""
+    """Markdown; a heading for each table, the first one apart if it is that of the whole."""
     how: str
     """Command, commit, date and time."""
+    picture: str = ""
+    """Which one of the body's pictures is shown, by its stem."""
 
 
 def page_text(
@@ -52,10 +55,10 @@ def page_text(
 
 def _laid_out(section: Section, name: str, files: dict[str, list[list[str]]]) -> list[str]:
     """The answer, a picture and a short table, then what to see in them; other tables are files."""
-    shown, links, caption, tables, pictures, kept = [], [], section.title, 0, 0, True
+    shown, links, caption, tables, place, kept = [], [], section.title, 0, None, True
     for block in _blocks(section.body):
-        if block.startswith("### "):
-            caption = block.removeprefix("### ")
+        if block.startswith("#"):
+            caption = block.lstrip("# ") if block.startswith("##") else caption
         elif block.startswith("|"):
             kept = tables == 0 and _rows(block) <= _MOST_ROWS
             tables += kept
@@ -67,15 +70,15 @@ def _laid_out(section: Section, name: str, files: dict[str, list[list[str]]]) ->
             file = f"{stem}_{count + 1}.csv" if count else f"{stem}.csv"
             files[file] = _cells(block)
             links.append(f"[{caption}]({name}/{file})")
-        elif block.startswith(("![", "*")) and not block.startswith("**"):  # a picture, then its caption
-            pictures += block.startswith("![")
-            shown += [block] if pictures == 1 else []
+        elif picture := _PICTURE.fullmatch(block):  # and its caption
+            if picture[2] == section.picture:
+                shown.append(f"![{picture[1]}]({name}/{picture[2]}.svg)\n\n*{picture[1]}*")
+                place = len(shown)
         elif block.startswith("```") and block.count("\n") > _MOST_LINES + 1:
             shown.append(f"<details>\n<summary>Printed output</summary>\n\n{block}\n\n</details>")
-        elif kept or not tables:  # the note of a table goes with it
-            shown.append(block)
-    below = (k for k, block in enumerate(shown) if block.startswith(("###", "|", "`", "<")))
-    shown.insert(next(below, len(shown)) if pictures else 0, section.see)
+        elif not (block.startswith("*") and not block.startswith("**")) and (kept or not tables):
+            shown.append(block)  # the note of a table goes with it
+    shown.insert(0 if place is None else place, section.see)
     return "\n\n".join([*shown, *([f"Tables: {', '.join(links)}."] if links else [])]).splitlines()
 
 

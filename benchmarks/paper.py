@@ -27,7 +27,7 @@ from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figu
 from torch_ekm.experiments.reporting.report import Cell, Report, Table
 from torch_ekm.experiments.reporting.statistics import DataFrame, bootstrap_mean
 from torch_ekm.experiments.reporting.tables import prediction_means
-from torch_ekm.experiments.reproduce import run_trials
+from torch_ekm.experiments.reproduce import Experiment, run_trials
 
 #: The last row of Table II as it is printed: E-KM:KM [%].
 RATIOS = {"weighted_box": 31.5, "box": 28.5, "bottle": 38.5, "applier": 70.0, "can": 54.5}
@@ -137,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     todo = sum(len(one.jobs(seeds)) for one in protocols.values())
     with progress("running", todo) as advance:
         found = {
-            name: run_trials(one, seeds, given.out / name, given.jobs, advance)
+            name: run_trials(Experiment(one, seeds), given.out / name, given.jobs, advance)
             for name, one in protocols.items()
         }
     trials = found.pop("online")

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
+from typing import Any
 
-from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, WHOLE_TURNS, Contender
+from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, READINGS, WHOLE_TURNS, Contender
 from matrix import Frame, Question, bands_table, learning_picture, table
+from sensing import hall_table
 from sessions import TARGETS, directions, foresight, new_objects, there_and_back, turns
 
+from torch_ekm.experiments.config import Setting
+from torch_ekm.experiments.protocols.generalize import ENDS, TABLE_I, paper_table, significance_table
 from torch_ekm.experiments.reporting.report import Table
+from torch_ekm.experiments.reporting.tables import controller_table, prediction_table, reason_table
 
 _ANGLES = (9.0, 19.0, 27.0)  # [deg] from fresh grasps
-_WARM_UP = {"learns_by": 3}  # turns of the E-KM before those that count
+_WARM_UP: dict[str, Any] = {"learns_by": 3}  # turns of the E-KM before those that count
+_TO_THE_END = {"angles": None, **_WARM_UP}  # shares of each object's workspace, as in the paper's Table I
 BY_HAND = {"angles": _ANGLES, **_WARM_UP}
-SHORT = {"angles": (4.0,), "learns_by": ()}
+_FIRST = ("turns", "lost", "reached", "motions", "first motion [deg]", "error [deg]", "other ends")
 _ENDS = ("turns", "lost", "reached", "motions", "error [deg]", "other ends")
 _MOVEMENTS = ("turns", "lost", "reached", "turning movements", "motions", "seconds", "error [deg]")
 #: The camera has 20 Hz and is 0.05 s late.
 _CAMERA = {"frame_rate": 20.0, "latency": 0.05}
 #: True errors that are called near a focused pose.
-WITHIN = {"deg": 0.25, "mm": 0.2}
+_WITHIN = {"deg": 0.25, "mm": 0.2}
+_SEEN = Setting(sensing=True)
 
 
 def _ends(trials: Frame) -> Table:
@@ -38,96 +45,86 @@ def _first(trials: Frame) -> Table:
 
 
 _WHOLE_TURN = Question(
-    "Whole turns: with a plan and without, f and g",
-    turns,
-    WHOLE_TURNS,
-    hands="nominal,fingertips x 2,friction 0.4,odd 4",
-    objects="box,can,bottle",
+    "whole_turn", "Whole turns: with a plan and without, f and g", turns, WHOLE_TURNS,
+    hands=("nominal", "losing"), objects=("box", "can", "bottle"), plant=_CAMERA, columns=_MOVEMENTS,
     options={"angles": _ANGLES, "learns_by": (14.0, -8.0, 22.0), "all_learn": True},
-    plant=_CAMERA,
-    columns=_MOVEMENTS,
-    more=(_first, _ends, bands_table),
-    quick={"angles": (5.0,), "learns_by": (4.0,)},
-)
-QUESTIONS: dict[str, Question] = {
-    "whole_turn": _WHOLE_TURN,
-    "plan": dataclasses.replace(
-        _WHOLE_TURN, title="Parts of the plan, on hands that lose objects", contenders=PLANS, hands="losing"
+    more=(_first, _ends, bands_table), short={"angles": (5.0,), "learns_by": (4.0,)},
+)  # fmt: skip
+_ASKED = (
+    Question(
+        "generalize", "Every object by shares of its workspace, every controller", turns, PLAIN,
+        objects=(*TABLE_I, *ENDS), setting=_SEEN, options=_TO_THE_END, columns=(), split="object",
+        more=(controller_table, prediction_table, reason_table, paper_table, significance_table),
     ),
-    "series": Question(
-        "Turns without a new grasp",
-        there_and_back,
-        {"E-KM": Contender()},
-        options={"learns_by": (9.0, -9.0, 15.0), "angle": 15.0, "times": 20},
-        by="part",
+    Question(
+        "hands", "Hands of other kinds", turns, {name: PLAIN[name] for name in ("E-KM", "KM+S", "KM+I")},
+        hands=("all",), objects=("box", "bottle"), options=BY_HAND, columns=_ENDS,
+    ),
+    Question(
+        "conditions", "Friction, mass, size, palm, left hand and centred grasps", turns,
+        {name: PLAIN[name] for name in ("E-KM", "KM+I")}, hands=("conditions",), options=BY_HAND,
+        columns=_ENDS,
+    ),
+    Question(
+        "new_object", "Objects that are new to the hand", new_objects, BEGINNINGS,
+        objects=("box", "can", "bottle", "jar"), together=True, setting=_SEEN, options={"angles": _ANGLES},
+        columns=(*_ENDS[:4], "KM, first 5 [deg]", "E-KM, first 5 [deg]", "error [deg]"), split="object",
+        picture=learning_picture, short={"angles": (4.0,)},
+    ),
+    Question(
+        "engines", "The same turns in two physics engines", turns, {"E-KM": Contender()}, hands=("engines",),
+        objects=tuple(TABLE_I), setting=_SEEN, options=_TO_THE_END, by="plant", columns=_ENDS, split="object",
+    ),
+    _WHOLE_TURN,
+    replace(
+        _WHOLE_TURN, name="plan", title="Parts of the plan, on hands that lose objects", contenders=PLANS,
+        hands=("losing",),
+    ),
+    Question(
+        "parts", "Parts of model and learner, on hands that lose objects", turns, PARTS,
+        hands=("nominal", "losing"), objects=("box", "can", "bottle"), options=BY_HAND,
+        columns=(*_ENDS[:5], "predicted by the KM [deg]", "by the E-KM [deg]"),
+    ),
+    Question(
+        "printed", "The paper's own system", turns, PRINTED, objects=tuple(TABLE_I), options=_TO_THE_END,
+        columns=_FIRST, split="object",
+    ),
+    Question(
+        "sensing", "What each reading is worth", turns, READINGS, setting=_SEEN.replace(engine="mujoco"),
+        options=BY_HAND, split="object", more=(hall_table,),
+        columns=(
+            "turns", "lost", "reached", "error [deg]", "by the E-KM [deg]", "joints off by [deg]",
+            "motors off by [deg]",
+        ),
+    ),
+    Question(
+        "oracle", "The E-KM and an oracle that knows hand, pose and forces", turns, ORACLE,
+        objects=("tea_tin", "carton"), setting=Setting(), options=_TO_THE_END, columns=_ENDS, split="object",
+    ),
+    Question(
+        "series", "Turns without a new grasp", there_and_back, {"E-KM": Contender()},
+        options={"learns_by": (9.0, -9.0, 15.0), "angle": 15.0, "times": 20}, by="part", split="object",
         columns=(*_ENDS[:4], "along the grip, last [mm]", "contacts slid, last [mm]", "other ends"),
-        split="object",
-        quick={"learns_by": (), "angle": 6.0, "times": 1},
+        short={"learns_by": (), "angle": 6.0, "times": 1},
     ),
-    "directions": Question(
-        "Focused poses of one to six directions",
-        directions,
-        {"E-KM": Contender()},
+    Question(
+        "directions", "Focused poses of one to six directions", directions, {"E-KM": Contender()},
+        setting=Setting(engine="mujoco", frames=8), by="group", split="object",
         options={
-            "learns_by": (9.0, 19.0, 12.0),
-            "groups": tuple(TARGETS),
-            "within": WITHIN,
-            "stricter": 0.6,
+            "learns_by": (9.0, 19.0, 12.0), "groups": tuple(TARGETS), "within": _WITHIN, "stricter": 0.6
         },
-        setting={"frames": 8},
-        by="group",
         columns=("turns", "declined", "within", "turn [deg]", "shift [mm]", "motions", "lost"),
-        split="object",
-        quick={"learns_by": (), "groups": ("shift 3 mm",)},
+        short={"learns_by": (), "groups": ("shift 3 mm",)},
     ),
-    "foresight": Question(
-        "How far a grasp turns, whether that is predicted, and turns without the camera",
-        foresight,
-        ORACLE,
-        objects="box,weighted_box,can,bottle,applier,tea_tin,jar",
-        engine="sapien",
-        options={"learns_by": (15.0, 15.0, 15.0), "far": 70.0, "blind": 15.0},
-        by="case",
+    Question(
+        "foresight", "How far a grasp turns, whether that is predicted, and turns without the camera",
+        foresight, ORACLE, objects=("box", "weighted_box", "can", "bottle", "applier", "tea_tin", "jar"),
+        setting=Setting(), options={"learns_by": (15.0, 15.0, 15.0), "far": 70.0, "blind": 15.0}, by="case",
         columns=(
             "turns", "lost", "reached", "farthest [deg]", "predicted end off by [deg]",
             "estimate off by [deg]", "stated sd [deg]",
         ),
-        split="object",
-        quick={"learns_by": (), "far": 6.0, "blind": 5.0},
+        split="object", short={"learns_by": (), "far": 6.0, "blind": 5.0},
     ),
-    "hands": Question(
-        "Hands of other kinds", turns, {n: PLAIN[n] for n in ("E-KM", "KM+S", "KM+I")}, hands="all",
-        objects="box,bottle", options=BY_HAND, columns=_ENDS, quick=SHORT,
-    ),
-    "conditions": Question(
-        "Friction, mass, size, palm, left hand and centred grasps", turns,
-        {n: PLAIN[n] for n in ("E-KM", "KM+I")}, hands="conditions", options=BY_HAND, columns=_ENDS,
-        quick=SHORT,
-    ),
-    "engines": Question(
-        "The same turns in two physics engines", turns, {"E-KM": Contender()}, hands="engines",
-        objects="box,weighted_box,can,bottle,applier", options={**_WARM_UP, "angles": None}, by="plant",
-        setting={"sensing": True}, columns=_ENDS, split="object", quick=SHORT,
-    ),
-    "new_object": Question(
-        "Objects that are new to the hand", new_objects, BEGINNINGS, objects="box,can,bottle,jar",
-        engine="sapien", options={"angles": _ANGLES}, together=True, setting={"sensing": True},
-        columns=(*_ENDS[:4], "KM, first 5 [deg]", "E-KM, first 5 [deg]", "error [deg]"),
-        split="object", picture=learning_picture, quick={"angles": (4.0,)},
-    ),
-    "printed": Question(
-        "The paper's own system", turns, PRINTED, objects="box,weighted_box,can,bottle,applier",
-        options={**_WARM_UP, "angles": None}, split="object",
-        columns=("turns", "lost", "reached", "motions", "first motion [deg]", "error [deg]", "other ends"),
-        quick=SHORT,
-    ),
-    "parts": Question(
-        "Parts of model and learner, on hands that lose objects", turns, PARTS, hands="nominal,losing",
-        objects="box,can,bottle", options=BY_HAND, quick=SHORT,
-        columns=(*_ENDS[:5], "predicted by the KM [deg]", "by the E-KM [deg]"),
-    ),
-    "oracle": Question(
-        "The E-KM and an oracle that knows hand, pose and forces", turns, ORACLE, objects="tea_tin,carton",
-        engine="sapien", options={**_WARM_UP, "angles": None}, columns=_ENDS, split="object", quick=SHORT,
-    ),
-}  # fmt: skip
+)  # fmt: skip
+QUESTIONS = {asked.name: asked for asked in _ASKED}

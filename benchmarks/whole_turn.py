@@ -16,7 +16,7 @@ from questions import QUESTIONS
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    ask("whole_turn", QUESTIONS["whole_turn"], arguments, __doc__)
+    ask(QUESTIONS["whole_turn"], arguments, __doc__)
 
 
 if __name__ == "__main__":

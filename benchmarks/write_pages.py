@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import dataclasses
 import datetime
 import json
 import os
@@ -26,10 +25,7 @@ import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 
-import pandas
 from page import ROOT, Section, commit, page_text, provenance
-
-from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 
 HERE = Path(__file__).parent
 PAGES = ROOT / "docs" / "benchmarks"
@@ -49,8 +45,8 @@ class Part:
     """What makes it short."""
     text: bool = False
     """It prints text, not Markdown."""
-    pictures: tuple[str, ...] = ()
-    """Figures of its report that the page shows."""
+    picture: str = ""
+    """The figure of its report that the page shows."""
 
     @property
     def reports(self) -> bool:
@@ -63,19 +59,17 @@ class Part:
         words = f"{self.command} {self.quick if quick else ''}".format(out=out, data=data).split()
         if words[0] == "torch-ekm":
             return [sys.executable, "-c", "from torch_ekm.cli import main; main()", *words[1:]]
-        if words[0] == "pytest":
-            return [sys.executable, "-m", *words]
         return [sys.executable, str(HERE / words[0]), *words[1:]]
 
     def spoken(self) -> str:
         """The command as a reader would type it."""
         words = self.command.format(out="FOLDER", data="DATA")
-        return words if words.startswith(("torch-ekm", "pytest")) else f"python benchmarks/{words}"
+        return words if words.startswith("torch-ekm") else f"python benchmarks/{words}"
 
 
 def parts_of(name: str) -> list[Part]:
     """The commands of a page."""
-    return [Part(**{**part, "pictures": tuple(part.get("pictures", ()))}) for part in PLAN[name]["parts"]]
+    return [Part(**part) for part in PLAN[name]["parts"]]
 
 
 def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]:
@@ -106,25 +100,6 @@ def measure(part: Part, folder: Path, quick: bool, keep: bool) -> dict[str, str]
     return found
 
 
-def read_report(folder: Path) -> Report:
-    """A report that :meth:`Report.write` left, its tables as text."""
-    texts = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-    tables = []
-    for table in texts.pop("tables"):
-        cells = pandas.read_csv(folder / f"{table['name']}.csv", dtype=str, keep_default_na=False)
-        tables.append(Table(**table, columns=list(cells.columns), rows=cells.to_numpy().tolist()))
-    figures = [FigureFile(**figure) for figure in texts.pop("figures")]
-    return Report(**texts, tables=tables, figures=figures)
-
-
-def report_body(folder: Path, name: str, pictures: tuple[str, ...]) -> str:
-    """A report below the headings of a page, with some of its figures, which lie in the folder ``name``."""
-    report = read_report(folder)
-    shown = [figure for figure in report.figures if Path(figure.path).stem in pictures]
-    report.figures = [dataclasses.replace(figure, path=f"{name}/{figure.path}") for figure in shown]
-    return report.markdown(level=2).strip()
-
-
 def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
     """A page, and the pictures that it shows."""
     sections = []
@@ -135,18 +110,16 @@ def write(name: str, out: Path, page: Path, quick: bool, keep: bool) -> None:
         if part.text:
             body = f"```text\n{body}\n```"
         elif part.reports:
-            body = report_body(folder / "report", name, part.pictures)
+            body = (folder / "report" / "report.md").read_text(encoding="utf-8")
         how = f"`{part.spoken()}`: commit {found['commit']}, {found['date']}, {found['minutes']} min."
-        sections.append(Section(part.title, part.see, body, how))
-        for picture in part.pictures:
-            (page.parent / name).mkdir(exist_ok=True)
-            shutil.copy(folder / "report" / f"{picture}.svg", page.parent / name)
+        sections.append(Section(part.title, part.see, body, how, part.picture))
+        (page.parent / name).mkdir(parents=True, exist_ok=True)
+        if part.picture:
+            shutil.copy(folder / "report" / f"{part.picture}.svg", page.parent / name)
     written = provenance(f"python benchmarks/write_pages.py {name}")
-    page.parent.mkdir(parents=True, exist_ok=True)
     files: dict[str, list[list[str]]] = {}
     page.write_text(page_text(PLAN[name]["title"], sections, written, name, files), encoding="utf-8")
     for file, rows in files.items():
-        (page.parent / name).mkdir(exist_ok=True)
         with (page.parent / name / file).open("w", newline="", encoding="utf-8") as stream:
             csv.writer(stream, lineterminator="\n").writerows(rows)
     print(f"{page}", flush=True)

@@ -32,7 +32,7 @@ from .nominal import (
     through_play,
 )
 from .recordings import APART, RecordedPath, known_diameter, read_recordings
-from .scores import SUBSETS, Row, score
+from .scores import Row, score
 from .states import States, estimate_states
 from .synthetic import write_synthetic
 
@@ -64,17 +64,6 @@ class RecordedHandResult:
     def reported(self) -> list[str]:
         """Objects on which nothing was identified."""
         return [name for name in self.paths if name != APART]
-
-    def row(self, name: str, horizon: int, subset: str = "all") -> Row:
-        """One row of the results.
-
-        Raises:
-            UnknownNameError: there is none of that name at this horizon; the message lists all.
-        """
-        own = {r.name: r for r in self.rows if (r.horizon, r.subset) == (horizon, subset)}
-        if name not in own:
-            raise UnknownNameError("prediction", name, own)
-        return own[name]
 
 
 def predict_recorded_hand(
@@ -150,7 +139,7 @@ def predict_recorded_hand(
     for (name, horizon), own in predicted.items():
         taken = {key: samples[horizon][key] for key in order}
         unit = samples[horizon][APART].motion.std(axis=0)
-        rows += [score(name, horizon, subset, taken, own, unit) for subset in SUBSETS]
+        rows.append(score(name, horizon, taken, own, unit))
     return RecordedHandResult(paths, states, samples, predicted, rows, markers, calibration)
 
 

@@ -14,20 +14,15 @@ from torch_ekm.typing import Array
 from .nominal import Samples
 
 COORDINATES = ("x", "y", "angle")
-FIRST = 50
-"""Samples of an object that count as its first."""
-SUBSETS = {"all": "all samples", "first": f"the first {FIRST} samples of each object"}
 _CUT = 0.99  # quantile of each coordinate at which errors and motions are cut: an object that drops
 
 
 class Row(NamedTuple):
-    """One way to predict, at one horizon, on some of the samples."""
+    """One way to predict, at one horizon."""
 
     name: str
     horizon: int
     """[steps of 0.1 s]"""
-    subset: str
-    """A key of :data:`SUBSETS`."""
     ratio: dict[str, Estimate]
     """Of each coordinate: rms error over rms motion, cut; 1: as if nothing moved."""
     rms: float
@@ -37,7 +32,6 @@ class Row(NamedTuple):
 def score(
     name: str,
     horizon: int,
-    subset: str,
     samples: Mapping[str, Samples],
     predicted: Mapping[str, Array],
     unit: Array,
@@ -49,9 +43,8 @@ def score(
         predicted: of the same objects.
         unit: spread of the motion of the recording set apart ``(3,)``.
     """
-    first = FIRST if subset == "first" else None
-    motion = {key: taken.motion[:first] for key, taken in samples.items()}
-    error = {key: motion[key] - predicted[key][:first] for key in samples}
+    motion = {key: taken.motion for key, taken in samples.items()}
+    error = {key: motion[key] - predicted[key] for key in samples}
     blocks = np.repeat(np.arange(len(samples)), [len(part) for part in motion.values()])
     wrong, moved = (_cut(np.concatenate(list(parts.values()))) ** 2 for parts in (error, motion))
     ratio = {c: block_bootstrap(wrong[:, k], moved[:, k], blocks) for k, c in enumerate(COORDINATES)}
@@ -60,7 +53,7 @@ def score(
         for key in samples
         if len(motion[key])
     ]
-    return Row(name, horizon, subset, ratio, float(np.mean(rms)))
+    return Row(name, horizon, ratio, float(np.mean(rms)))
 
 
 def _cut(values: Array) -> Array:

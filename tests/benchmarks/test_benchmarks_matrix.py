@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,14 @@ import torch
 
 pytest.importorskip("matrix", reason="the benchmarks are not part of this installation")
 pytest.importorskip("mujoco")
+sys.path.append(str(Path(__file__).parents[1] / "experiments"))
 
 import matrix
-from contenders import BEGINNINGS, PARTS, PLANS, PRINTED, WHOLE_TURNS, MisprintedBench
+from contenders import BEGINNINGS, PARTS, PLANS, PRINTED, READINGS, WHOLE_TURNS, MisprintedBench
+from experiments_records import frame
 from hands import CONDITIONS, FAMILIES, OTHERS, STRENGTHS, hands
-from matrix import FIGURES, bands_table, frame_of, pivot, verdict
+from matrix import FIGURES, bands_table, pivot, verdict
 from questions import QUESTIONS
-from sensing import SENSING
 from sessions import TARGETS, Part, new_objects, target_of
 
 from torch_ekm.control.safety.on_the_way import OnTheWay
@@ -34,13 +36,14 @@ from torch_ekm.simulation import preset
 BANDS = ([1, 0.5, 0.2, [0.1, -2.0]], [6, -1.7, 0.1, []])
 
 
-def row(reason: str, turning: int, off: float = 1.0, ekm: tuple[float, ...] = (), **figures) -> dict:
-    record = TrialRecord(
+def row(
+    reason: str, turning: int, off: float = 1.0, ekm: tuple[float, ...] = (), contender="E-KM", **figures
+) -> TrialRecord:
+    return TrialRecord(
         "box", "turn", "E-KM", 0, 1, 27.0, reason, "", 0.1, (27.0, 0.1), 0.1, (), (), (0.5,) * len(ekm),
         ekm, off, (0.01,) * (turning + 1), turning=turning, simulated_s=0.5 * turning,
-        more=figures,
+        more={"plant": "odd 4", "contender": contender, **figures},
     )  # fmt: skip
-    return vars(record)
 
 
 def test_every_family_has_three_strengths_that_differ_from_the_nominal_hand() -> None:
@@ -66,7 +69,7 @@ def test_every_family_has_three_strengths_that_differ_from_the_nominal_hand() ->
         hands(["arm"])
 
 
-@pytest.mark.parametrize("group", [WHOLE_TURNS, PLANS, PARTS, PRINTED, BEGINNINGS, SENSING.contenders])
+@pytest.mark.parametrize("group", [WHOLE_TURNS, PLANS, PARTS, PRINTED, BEGINNINGS, READINGS])
 def test_contenders_differ_in_what_they_are_called(group) -> None:
     made = [(one.controller, one.bench, one.setting(Setting())) for one in group.values()]
     assert len({str(one) for one in made}) == len(group)
@@ -80,8 +83,7 @@ def test_lost_reached_movements_and_bands_are_counted() -> None:
         row("object lost", 9, bands=[]),
         row("reached", 3, off=31.0, bands=[]),  # turned off the axis beyond help
     ]
-    keys = {"a": ("odd 4", "E-KM"), "b": ("odd 4", "without plan")}
-    turns = frame_of({"a": ours, "b": [row("reached", 8, bands=[])]}, keys)
+    turns = frame([*ours, row("reached", 8, contender="without plan", bands=[])])
     told = (
         "E-KM lost 2 of 5, reached 2, turning movements 1.5, all motions 2.5, seconds 0.8; "
         "without plan lost 0 of 1, reached 1, turning movements 8.0, all motions 9.0, seconds 4.0"
@@ -101,8 +103,7 @@ def test_lost_reached_movements_and_bands_are_counted() -> None:
 
 def test_an_end_without_a_grasp_is_no_turn() -> None:
     lost = TrialRecord("box", "turn", "KM", 0, 1, 9.0, NOT_GRASPED, "too wide")
-    rows = [vars(lost), row("reached", 1)]
-    assert len(frame_of({"a": rows}, {"a": ("nominal", "KM")})) == 1
+    assert len(QUESTIONS["hands"].counted(frame([lost, row("reached", 1)]))) == 1
 
 
 def test_targets_have_one_to_six_directions_each_named_once() -> None:
@@ -145,7 +146,7 @@ def test_a_question_runs_and_what_is_done_is_kept(tmp_path: Path, capsys: pytest
     last = capsys.readouterr().out.splitlines()[-1]
     assert last.startswith("E-KM lost 0 of 1, reached 1, turning movements ")
     assert "; without plan lost 0 of 1" in last
-    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("nominal_box_*.json")}
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("runs/nominal_box_*.json")}
     assert len(kept) == 2
     matrix.main(words)
     assert capsys.readouterr().out.splitlines()[-1] == last
@@ -166,12 +167,12 @@ def test_movements_of_a_loop_without_watch_go_to_their_end(tmp_path: Path, monke
         assert bool(asked) == watched
 
 
-@pytest.mark.parametrize("name", ["series", "directions", "printed", "new_object"])
+@pytest.mark.parametrize("name", ["generalize", "series", "directions", "printed", "new_object"])
 def test_every_kind_of_session_runs(name: str, tmp_path: Path) -> None:
     asked = QUESTIONS[name]
-    made = matrix.ask(name, asked, ["--quick", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)])
+    made = matrix.ask(asked, ["--quick", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)])
     assert all(len(table.rows) for table in made.tables)
-    assert made.tables[0].header[1:] == list(asked.columns)
+    assert not asked.columns or made.tables[0].header[1:] == list(asked.columns)
 
 
 def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -195,7 +196,7 @@ def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.Monkey
 
 def test_foresight_says_what_was_predicted_and_what_came(tmp_path: Path) -> None:
     words = ["--quick", "--engine", "mujoco", "--jobs", "1", "--contenders", "E-KM", "--out", str(tmp_path)]
-    made = matrix.ask("foresight", QUESTIONS["foresight"], words)
+    made = matrix.ask(QUESTIONS["foresight"], words)
     parts = {text[0]: text for text in made.tables[0].text()}
     assert list(parts) == [
         "E-KM, blind, by touch", "E-KM, blind, prediction alone", "E-KM, as far as it goes"
@@ -208,7 +209,7 @@ def test_foresight_says_what_was_predicted_and_what_came(tmp_path: Path) -> None
 
 def test_tables_fit_on_a_page() -> None:
     """At most eight columns, and eight rows of contenders."""
-    for name, asked in {**QUESTIONS, "sensing": SENSING}.items():
+    for name, asked in QUESTIONS.items():
         assert len(asked.columns) <= 7, name
         assert not set(asked.columns) - set(FIGURES), name
         assert len(asked.contenders) <= 8, name

@@ -36,7 +36,7 @@ def test_every_command_is_there() -> None:
 
 def test_no_picture_of_a_page_is_written_over_by_another() -> None:
     for name in write_pages.PLAN:
-        pictures = [picture for part in write_pages.parts_of(name) for picture in part.pictures]
+        pictures = [part.picture for part in write_pages.parts_of(name) if part.picture]
         assert len(pictures) == len(set(pictures)), name
 
 
@@ -68,11 +68,10 @@ def test_half_a_result_of_another_commit_is_not_gone_on_with(
 ) -> None:
     script = tmp_path / "resume.py"
     script.write_text(  # the file of Report.write alone: its import would take seconds
-        "import json, pathlib, sys\n"
+        "import pathlib, sys\n"
         "done = pathlib.Path(sys.argv[1]); done.mkdir(exist_ok=True)\n"
         "summary = f'{len(list(done.glob(\"run_*\")))} runs were there'\n"
-        "report = {'title': 'T', 'summary': summary, 'tables': [], 'figures': []}\n"
-        "(done / 'report.json').write_text(json.dumps(report))\n"
+        "(done / 'report.md').write_text(summary)\n"
         "(done / 'run_1').touch()\n"
     )
     _plan(tmp_path, monkeypatch, f"{script} {{out}}")
@@ -104,7 +103,7 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     )
     _plan(tmp_path, monkeypatch, f"{script} {{out}}")
     (part,) = write_pages.PLAN["one"]["parts"]
-    part["pictures"] = ["shown"]
+    part["picture"] = "shown"
     write_pages.main(["one", "--quick", "--out", str(tmp_path / "out")])
     text = (tmp_path / "out" / "one.md").read_text(encoding="utf-8")
     assert "# Title" not in text
@@ -123,10 +122,11 @@ def test_results_come_first_and_long_tables_are_files() -> None:
     picture = "![Seen.](a.svg)\n\n*Seen.*"
     body = f"Answer.\n\n{picture}\n\n### Short\n\n{table(8)}\n\nNote.\n\n### Other\n\n{table(2)}\n\nIts note."
     files: dict[str, list[list[str]]] = {}
-    text = page_text("Page", [Section("Part", "See.", body, "`run`: commit 1.")], ["By it."], "one", files)
+    part = Section("Part", "See.", body, "`run`: commit 1.", "a")
+    text = page_text("Page", [part], ["By it."], "one", files)
     shown = [
         "Answer.",
-        picture,
+        picture.replace("a.svg", "one/a.svg"),
         "See.",
         f"### Short\n\n{table(8)}\n\nNote.",
         "Tables: [Other](one/other.csv).",

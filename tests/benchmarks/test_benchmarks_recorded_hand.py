@@ -13,12 +13,7 @@ import pytest
 import recorded_hand.benchmark
 import torch
 from recorded_hand.benchmark import predict_recorded_hand
-from recorded_hand.fingers import (
-    PlanarFingers,
-    camera_of,
-    identify_markers,
-    register_camera,
-)
+from recorded_hand.fingers import PlanarFingers, camera_of, identify_markers, register_camera
 from recorded_hand.nominal import through_play
 from recorded_hand.recordings import APART, UNIT, RecordedPath, read_recordings
 from recorded_hand.report import write_report
@@ -43,6 +38,11 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def result(folder):
     return predict_recorded_hand(folder, learners=["linear RLS"], quick=True)
+
+
+def ratio(result, name):
+    """Five seconds ahead."""
+    return next(row.ratio for row in result.rows if (row.name, row.horizon) == (name, 50))
 
 
 def whole(paths, part):
@@ -122,11 +122,11 @@ def test_play_begins_at_its_closing_end():
 
 def test_the_model_foresees_what_it_made(result):
     """Rigid, and with a diameter to be found: above all how objects of other diameters roll, and the play."""
-    model = result.row("KM, published figures, play", 50).ratio
+    model = ratio(result, "KM, published figures, play")
     assert model["x"].mean < 0.2
-    assert model["angle"].mean < 0.6 * result.row("constant Jacobian, play", 50).ratio["angle"].mean
-    assert result.row("KM, published figures", 50).ratio["x"].mean > 3 * model["x"].mean
-    assert result.row("no model", 50).ratio["x"].mean == pytest.approx(1.0)
+    assert model["angle"].mean < 0.6 * ratio(result, "constant Jacobian, play")["angle"].mean
+    assert ratio(result, "KM, published figures")["x"].mean > 3 * model["x"].mean
+    assert ratio(result, "no model")["x"].mean == pytest.approx(1.0)
     states = result.states["poly6_d_v0"]
     assert states.found.mean() > 0.95
     assert np.median(states.diameter) == pytest.approx(OBJECTS["poly6_d_v0"], abs=3e-3)
@@ -161,12 +161,10 @@ def test_a_learner_sees_each_sample_after_its_prediction(result):
 
 def test_the_page_has_its_tables_and_pictures(result, tmp_path):
     report = write_report(result, tmp_path)
-    assert (tmp_path / "index.html").stat().st_size > 10_000
-    assert [figure.path for figure in report.figures] == ["scores.svg", "paths.svg"]
+    assert (tmp_path / "index.html").stat().st_size > 5_000
+    assert [figure.path for figure in report.figures] == ["scores.svg"]
     names = {table.name for table in report.tables}
-    assert names == {f"scores_{h}_{s}" for h in (10, 50) for s in ("all", "first")}
-    with pytest.raises(UnknownNameError, match="no model"):
-        result.row("an oracle", 50)
+    assert names == {"scores_10", "scores_50"}
 
 
 def save(folder, key, states):
@@ -203,7 +201,7 @@ def test_command_line_runs_without_data(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [place, *options])
     runpy.run_path(place, run_name="__main__")
     assert "KM, published figures" in capsys.readouterr().out
-    assert (tmp_path / "index.html").stat().st_size > 10_000
+    assert (tmp_path / "index.html").stat().st_size > 5_000
 
 
 @pytest.mark.skipif(
@@ -212,7 +210,7 @@ def test_command_line_runs_without_data(folder, tmp_path, monkeypatch, capsys):
 def test_published_figures_foresee_a_real_object():
     """Five seconds ahead, two paths of three objects: far below a constant Jacobian in y."""
     result = predict_recorded_hand(DATA, learners=["model alone"], quick=True)
-    published = result.row("KM, published figures, play", 50).ratio
-    constant = result.row("constant Jacobian, play", 50).ratio
+    published = ratio(result, "KM, published figures, play")
+    constant = ratio(result, "constant Jacobian, play")
     assert published["x"].mean < 0.5
     assert published["y"].mean < 0.75 * constant["y"].mean

@@ -51,10 +51,9 @@ demo box --seeds 0:99999999 | at most 10000 seeds
 demo box --jobs 0 | --jobs
 demo box --out file.txt | cannot be written
 reproduce nothing | unknown experiment
-reproduce online --objects box | only generalize
-reproduce online --angles 5 | only generalize
+reproduce online --objects box | 'online' does not take it
+reproduce online --angles 5 | 'online' does not take it
 reproduce generalize --objects nothing | unknown object
-reproduce generalize --objects folder | *.urdf files
 reproduce generalize --objects , | at least one object
 reproduce generalize --angles x | numbers separated by commas
 reproduce generalize --angles 0 | more than 0 and less than 180 deg

@@ -22,7 +22,6 @@ from torch_ekm.experiments.learner_comparison.scores import (
     block_bootstrap,
 )
 from torch_ekm.experiments.learner_comparison.stream import Stream
-from torch_ekm.experiments.learner_comparison.table_file import open_table
 from torch_ekm.experiments.learners import COMPARED, LEARNERS, learner_factory
 from torch_ekm.experiments.reporting.report import Report, Table
 
@@ -188,11 +187,3 @@ def test_an_absurd_density_is_told(compared: Comparison) -> None:
     absurd = dataclasses.replace(compared, scores=scores).verdicts()[0]
     assert "Errors far beyond the stated variance (NLL): model alone, linear RLS, SOGP plain" in absurd
     assert "NLL" not in compared.verdicts()[0]
-
-
-def test_a_stream_survives_its_file(tmp_path: Path) -> None:
-    stream = linear()
-    names, read = open_table(stream.save(tmp_path / "a.csv"))
-    values = read(names).values
-    assert names == ("x1", "x2", "x3", "y1", "y2")
-    np.testing.assert_array_equal(values, torch.cat([stream.x, stream.y], 1).numpy())

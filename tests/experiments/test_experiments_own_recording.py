@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
-from torch_ekm.experiments.learner_comparison.own_recording import Columns, load_own
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.run import compare
+from torch_ekm.experiments.learner_comparison.stream import Columns, load_own
 
 COLUMNS = Columns(state=["angle", "extra*"], command=["rate"], observation=["angle"])
 

@@ -9,13 +9,12 @@ import numpy as np
 import pandas
 import pytest
 import scipy.stats
-import torch
 from experiments_records import frame, not_grasped, turn
 
 from torch_ekm.exceptions import StateError
 from torch_ekm.experiments.protocols.generalize import significance_table
-from torch_ekm.experiments.protocols.online import Online, prediction_curves, recovery_trials
-from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord, prediction_error
+from torch_ekm.experiments.protocols.online import Online, learning, prediction_curves
+from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord
 from torch_ekm.experiments.reporting.report import Column, Table
 from torch_ekm.experiments.reporting.statistics import (
     Estimate,
@@ -52,13 +51,6 @@ def test_figures_that_a_record_does_not_have_are_refused() -> None:
     del figures["off_rotation_deg"]
     with pytest.raises(StateError, match="off_rotation_deg"):
         TrialRecord.from_json(figures)
-
-
-def test_prediction_error_picks_the_focused_rows_of_the_object() -> None:
-    increment, predicted = torch.arange(26.0), torch.zeros(26)
-    focus = torch.zeros(1, 6)
-    focus[0, 3] = 1.0
-    assert prediction_error(increment, predicted, focus).tolist() == [23.0]
 
 
 def test_lost_object_counts_with_the_whole_angle() -> None:
@@ -172,11 +164,12 @@ def test_learning_curve_marks_the_last_negative_result() -> None:
 
 
 def test_recovery_counts_from_the_trial_after_the_event() -> None:
-    trials = range(1, 9)
-    km, ekm = pandas.Series(1.0, trials), pandas.Series([0.2, 0.2, 2.0, 0.8, 0.4, 0.2, 0.2, 0.2], trials)
-    assert recovery_trials(ekm, km, event=3) == 2
-    assert recovery_trials(ekm, km, event=1) == 1
-    assert recovery_trials(km, km, event=3) is None
+    km = pandas.DataFrame(1.0, [0, 1], range(1, 9))
+    ekm = pandas.DataFrame([[0.2, 0.2, 2.0, 0.8, 0.4, 0.2, 0.2, 0.2], [1.0] * 8], [0, 1], range(1, 9))
+    found = learning(ekm, km, (1, 3, 8))
+    assert found.loc[0, ["after_1", "after_3"]].tolist() == [1, 2]
+    assert found.loc[1, ["after_1", "after_3"]].isna().all()
+    assert found["after_8"].isna().all()
 
 
 # -- tables ------------------------------------------------------------------------------------------
@@ -263,7 +256,7 @@ def test_why_turns_ended_is_told_of_each_controller() -> None:
     assert all(row[2] for row in cells.values())
 
 
-def test_learning_table_finds_the_last_negative_result() -> None:
+def test_learning_finds_the_last_negative_result() -> None:
     generator = np.random.default_rng(0)
     records = []
     for trial in range(1, 25):
@@ -272,10 +265,13 @@ def test_learning_table_finds_the_last_negative_result() -> None:
         km, ekm = (1.0 + noise[0],), (ekm + noise[1],)
         records.append(turn("E-KM", 0, trial=trial, prediction_km_deg=km, prediction_ekm_deg=ekm))
     online = Online(trials=24, dislocations=(10, 24), tendons_replaced=0)
-    row = online.learning_table(frame(records)).rows[0]
-    assert 3 <= row[1] <= 7
-    assert 0.25 <= row[3] <= 0.36  # trials 17 to 24 without 24
-    assert row[4:] == [1, None]  # after the last trial there is nothing to see
+    row = learning(*prediction_curves(frame(records), 24), online.events).loc[0]
+    assert 3 <= row.last_negative <= 7
+    assert 0.25 <= row.late <= 0.36  # trials 17 to 24 without 24
+    assert row.after_10 == 1
+    assert np.isnan(row.after_24)  # after the last trial there is nothing to see
+    found = {of[0]: of[2:] for of in online.paper_table(frame(records)).text()}
+    assert found["trials until recovered after trial 10"] == ["1.00", "1"]
     ekm, _ = prediction_curves(frame(records[:5]), 6)
     assert ekm.loc[0].notna().tolist() == [True] * 5 + [False]
 

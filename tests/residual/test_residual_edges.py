@@ -29,7 +29,6 @@ from torch_ekm.residual import (
     Standardize,
     ZeroResidual,
     default_learner,
-    running_scale,
 )
 
 
@@ -148,16 +147,15 @@ def test_a_fleet_that_detects_changes_with_a_memory_is_so_many_single_models():
         torch.testing.assert_close(fleet(x[:9])[:, i], single(x[:9, i]), atol=1e-9, rtol=0)
 
 
-def test_units_of_a_model_with_masks_are_those_of_its_own_samples(monkeypatch):
+def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
     x, y = stream(64, 2, 3)
     mask = torch.rand(64, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
     fleet = sogp(3, 2, capacity=12, batch_shape=(2, 3), parts=[Standardize()])
     fleet.update(x, y, mask)
     units = fleet.units
     assert units is not None
-    monkeypatch.setattr(running_scale, "_SETTLED", 0.0)
-    units.input.settle()
-    units.output.settle()
+    units.input.settle(settled=0.0)
+    units.output.settle(settled=0.0)
     for i, j in itertools.product(range(2), range(3)):
         own_x, own_y = x[mask[:, i, j], i, j], y[mask[:, i, j], i, j]
         torch.testing.assert_close(units.input.shift[i, j], own_x.mean(0), atol=0.05, rtol=0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from .._terminal import say_error  # first: needs the extra
-from ..exceptions import EKMError
+from ..exceptions import EKMError, MissingExtraError
 from . import describe as describe
 from . import experiments as experiments
 from . import logs as logs
@@ -32,6 +32,7 @@ def main() -> None:
     except typer.Abort:
         sys.exit(1)
     except (EKMError, OSError) as error:
-        say_error("; ".join([str(error), *getattr(error, "__notes__", ())]))
+        more = ["all commands run with extra 'experiments'"] * isinstance(error, MissingExtraError)
+        say_error("; ".join([str(error), *more, *getattr(error, "__notes__", ())]))
         sys.exit(1)
     sys.exit(code if isinstance(code, int) else 0)

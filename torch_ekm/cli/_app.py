@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, ParamSpec, TypeVar
+from typing import Annotated
 
 from .._terminal import say  # first: needs the extra
 from .._text import figure
 from .._versions import versions_of
-from ..exceptions import MissingExtraError, ParameterError
+from ..exceptions import ParameterError
 from ._help import Commands
 
 import typer  # isort: skip
 from typer import Option  # isort: skip
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 app = typer.Typer(
     cls=Commands,
@@ -36,8 +31,6 @@ Jobs = Annotated[int, Option(min=1, help="Processes at once.")]
 Page = Annotated[Path, Option(help="The page: one file, shown by any browser without a network.")]
 AN_OBJECT = "An object (see 'torch-ekm objects') or a path to a URDF."
 
-#: Extras, each part of the next: a command names the one that brings all that it needs.
-_NESTED = ("plots", "robot", "sim", "experiments")
 _MOST_SEEDS = 10_000
 _LARGEST_SEED = 2**31
 
@@ -51,24 +44,6 @@ def root(
         say(f"torch-ekm {versions_of(['torch_ekm'])['torch_ekm']}")
     elif context.invoked_subcommand is None:
         typer.echo(context.get_help())
-
-
-def needs(extra: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A command that needs an extra: what is missing is named with this one, not with a part of it."""
-
-    def decorate(command: Callable[P, R]) -> Callable[P, R]:
-        @functools.wraps(command)
-        def run(*arguments: P.args, **options: P.kwargs) -> R:
-            try:
-                return command(*arguments, **options)
-            except MissingExtraError as error:
-                if error.extra not in _NESTED[: _NESTED.index(extra) + 1]:
-                    raise
-                raise MissingExtraError(error.module, extra) from None
-
-        return run
-
-    return decorate
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -7,14 +7,13 @@ from typing import Annotated
 
 from .._terminal import console, print_table, say, say_next
 from ..exceptions import OutputError, ParameterError
-from ._app import AN_OBJECT, app, needs
+from ._app import AN_OBJECT, app
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
 
 
 @app.command()
-@needs("robot")
 def hands(
     new: Annotated[
         Path | None,
@@ -52,7 +51,6 @@ def hands(
 
 
 @app.command()
-@needs("robot")
 def objects() -> None:
     """List the objects of the package: mass [g], friction, grasp width [mm] and shapes."""
     from ..description import list_objects, load_object
@@ -68,7 +66,6 @@ def objects() -> None:
 
 
 @app.command()
-@needs("experiments")
 def check(
     hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "",
     object: Annotated[str, Argument(help=AN_OBJECT)] = "box",

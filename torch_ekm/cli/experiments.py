@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from .._terminal import print_report, progress, say, say_next
 from ..exceptions import ParameterError
-from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, needs, parse_angles, parse_seeds
+from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, parse_angles, parse_seeds
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -21,7 +21,6 @@ _SESSION = {"online": 70}
 
 
 @app.command()
-@needs("experiments")
 def demo(
     object: Annotated[str, Argument(help=AN_OBJECT)] = "box",
     out: Annotated[Path, Option(help="Folder for the report.")] = Path("demo_output"),
@@ -48,16 +47,13 @@ def demo(
 
 
 @app.command()
-@needs("experiments")
 def reproduce(
     experiment: Annotated[str, Argument(help="generalize or online.")] = "generalize",
     seeds: Annotated[str, Option(help="FIRST:END; each seed is an independent run.")] = "1000:1020",
     jobs: Jobs = 2,
     out: Annotated[Path | None, Option(help="Folder for the report [reproduce_<experiment>].")] = None,
     quick: Annotated[bool, Option(help="Two seeds, small turns: a trial run.")] = False,
-    objects: Annotated[
-        str, Option(help="Names separated by commas, or a folder with URDF files (generalize).")
-    ] = "",
+    objects: Annotated[str, Option(help="Names or URDF files, separated by commas (generalize).")] = "",
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
     engine: Engine = "sapien",
@@ -83,15 +79,14 @@ def reproduce(
     from ..experiments.reproduce import plan
 
     setting = Setting(hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing)
-    turns = parse_angles(angles) if angles else None
-    chosen, things = parse_seeds(seeds), objects or None
-    planned = plan(experiment, chosen, setting=setting, objects=things, angles_deg=turns, quick=quick)
+    changes = {"objects": names(objects)} if objects else {}
+    changes |= {"angles_deg": parse_angles(angles)} if angles else {}
+    planned = plan(experiment, parse_seeds(seeds), quick=quick, setting=setting, **changes)
     _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs)
     say_next("the whole of it: the same command without --quick" if quick else "open the report")
 
 
 @app.command()
-@needs("plots")
 def compare(
     data: Annotated[
         list[str], Option(help="A .csv or .parquet file, a ROS bag, or a recording's name; repeatable.")

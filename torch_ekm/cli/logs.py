@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from .._terminal import print_table, progress, say, say_next
-from ._app import AN_OBJECT, Engine, Hand, Page, Preset, Sensing, app, needs, parse_angles, parse_seeds
+from ._app import AN_OBJECT, Engine, Hand, Page, Preset, Sensing, app, parse_angles, parse_seeds
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 
 @app.command()
-@needs("experiments")
 def record(
     log: Annotated[Path, Argument(help="Folder of the log; an existing one is continued.")],
     object: Annotated[str, Option(help=AN_OBJECT)] = "box",
@@ -53,7 +52,6 @@ def record(
 
 
 @app.command()
-@needs("experiments")
 def show(
     what: Annotated[str, Argument(metavar="[HAND|LOG]", help="A hand, a URDF, or a log.")] = "icub_right",
     object: Annotated[str | None, Option(help="An object for the hand to hold.")] = None,
@@ -72,7 +70,6 @@ def show(
 
 
 @app.command()
-@needs("experiments")
 def replay(
     log: Annotated[Path, Argument(help="A log's folder, or the file of one trial.")],
     trial: Annotated[int | None, Option(min=0, help="Which trial; the first one by default.")] = None,
@@ -95,7 +92,6 @@ def replay(
 
 
 @app.command()
-@needs("sim")
 def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
     """Check every byte of a log.
 

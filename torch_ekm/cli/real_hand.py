@@ -9,7 +9,7 @@ from typing import Annotated
 
 from .._terminal import console, print_table, say, say_next
 from ..exceptions import ParameterError
-from ._app import app, needs
+from ._app import app
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -21,7 +21,6 @@ Learned = Annotated[
 
 
 @app.command()
-@needs("robot")
 def slack(
     plant: Wired, write: Annotated[bool, Option(help="Write the zeros into the wiring file.")] = False
 ) -> None:
@@ -47,7 +46,6 @@ def slack(
 
 
 @app.command()
-@needs("robot")
 def drivers(
     hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")],
     new: Annotated[Path, Option(metavar="TOML", help="The wiring file to write.")],
@@ -74,7 +72,6 @@ def drivers(
 
 
 @app.command(name="identify-servo")
-@needs("robot")
 def identify_servo(plant: Wired, out: Learned = None) -> None:
     """Find dead zone, bias and play of each motor of a real hand, by motions of 0.4 to 2 deg.
 
@@ -100,7 +97,6 @@ def identify_servo(plant: Wired, out: Learned = None) -> None:
 
 
 @app.command()
-@needs("sim")
 def health(
     logs: Annotated[list[Path], Argument(metavar="LOG...", help="Folders of logs of one hand, in order.")],
     hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
@@ -145,7 +141,6 @@ def health(
 
 
 @app.command()
-@needs("robot")
 def knowledge(
     file: Annotated[Path, Argument(metavar="EKM", help="File of what a closed loop has learned of a hand.")],
     hand: Annotated[str, Option(help="The hand; else the one that it was learned of.")] = "",

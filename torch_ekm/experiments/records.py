@@ -134,9 +134,9 @@ class TrialRecord(Trial):
         turned = [axis @ after.minus(before)[-3:] for before, after in pairwise(truth)]
 
         def errors(name: str) -> tuple[float, ...]:
-            pairs = ((step.increment, getattr(step.decision, name)) for step in steps)
-            wrong = (prediction_error(*pair, focus.matrix) for pair in pairs)
-            return tuple(float(torch.linalg.vector_norm(error)) / _DEG for error in wrong)
+            # M_c E_p (ds - predicted); the paper swaps e_ekm and e_km and leaves out M_c: see its figures
+            missed = (step.increment - getattr(step.decision, name) for step in steps)
+            return tuple(float((focus.matrix @ ds[-6:]).norm()) / _DEG for ds in missed)
 
         def true_errors(name: str) -> tuple[float, ...]:
             predicted = [axis @ getattr(step.decision, name)[-3:] for step in steps]
@@ -160,17 +160,6 @@ class TrialRecord(Trial):
             simulated_s=done.stop.final.time - steps[0].before.time if steps else 0.0,
             poses=tuple([s.q.tolist(), s.position.tolist(), s.rotation.tolist()] for s in truth if poses),
         )
-
-
-def prediction_error(
-    increment: Float[Tensor, " n_s"], predicted: Float[Tensor, " n_s"], focus: Float[Tensor, "n_x 6"]
-) -> Float[Tensor, " n_x"]:
-    """``e(t) = M_c E_p (ds(t) - predicted(t))``: one-step error of the focused pose.
-
-    The paper prints ``e_ekm`` and ``e_km`` swapped and leaves out ``- x_f(t)`` and ``M_c``; this is
-    what its figures show. ``predicted`` must be made *before* training on the sample.
-    """
-    return focus @ (increment - predicted)[-6:]
 
 
 def true_state(seen: Observation) -> GraspState:

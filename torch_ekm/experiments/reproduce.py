@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..description import load_object
 from ..exceptions import ParameterError, UnknownNameError
-from .config import FIRST_REPORTED, Setting
+from .config import FIRST_REPORTED
 from .jobs import run_jobs
 from .protocols.generalize import Generalize
 from .protocols.online import Online
@@ -42,44 +41,29 @@ class Experiment:
 
 
 def plan(
-    name: str,
-    seeds: tuple[int, ...] = REPORTED_SEEDS,
-    *,
-    setting: Setting | None = None,
-    objects: str | Path | None = None,
-    angles_deg: tuple[float, ...] | None = None,
-    quick: bool = False,
+    name: str, seeds: tuple[int, ...] = REPORTED_SEEDS, *, quick: bool = False, **changes: Any
 ) -> Experiment:
     """An experiment, nothing of it run yet.
 
     Args:
         name: a key of :data:`PROTOCOLS`.
         seeds: each is an independent run; every controller gets the same ones.
-        objects: names separated by commas, or a folder with URDF files, instead of the experiment's own.
-        angles_deg: turns to be made instead of the experiment's own.
         quick: two seeds and a few small turns: to see that it works, not to claim anything.
+        changes: of the protocol's fields: ``setting``; of "generalize" also ``objects``, ``angles_deg``.
 
     Raises:
         UnknownNameError: no such experiment; the message lists them.
-        ParameterError: no seeds, no URDF file in ``objects``, or an experiment that takes no objects
-            or no angles.
+        ParameterError: no seeds, or a field that the protocol does not have.
     """
     if name not in PROTOCOLS:
         raise UnknownNameError("experiment", name, PROTOCOLS)
     if not seeds:
         raise ParameterError("seeds", seeds, "at least one seed")
     protocol = PROTOCOLS[name]()
+    if unknown := [key for key in changes if not hasattr(protocol, key)]:
+        raise ParameterError(unknown[0], changes[unknown[0]], f"left out: '{name}' does not take it")
     if quick:
         protocol, seeds = protocol.quick(), seeds[: protocol.quick_seeds]
-    changes: dict[str, Any] = {} if setting is None else {"setting": setting}
-    if objects is not None:
-        changes["objects"] = objects_of(objects)
-    if angles_deg is not None:
-        changes["angles_deg"] = angles_deg
-    for key in changes:
-        takers = [name for name, kind in PROTOCOLS.items() if hasattr(kind(), key)]
-        if name not in takers:
-            raise ParameterError(key, changes[key], f"left out: only {', '.join(takers)} take them")
     return Experiment(dataclasses.replace(protocol, **changes), seeds, quick)  # pyright: ignore[reportArgumentType]
 
 
@@ -94,59 +78,31 @@ def reproduce(
     Args:
         processes, on_done: of :func:`~torch_ekm.experiments.jobs.run_jobs`.
     """
+    return write_report(experiment, run_trials(experiment, folder, processes, on_done), folder)
+
+
+def run_trials(
+    experiment: Experiment, folder: Path, processes: int = 1, on_done: Callable[[str], None] | None = None
+) -> DataFrame:
+    """The trials of all sessions; finished ones stay in ``folder/runs``."""
+    kept = run_jobs(experiment.protocol.run, experiment.jobs, folder / "runs", processes, on_done)
+    read = TrialRecord.from_json
+    return trial_frame({name: [read(figures) for figures in session] for name, session in kept.items()})
+
+
+def write_report(experiment: Experiment, trials: DataFrame, folder: Path) -> Report:
+    """What came of the trials, as a page and ``trials.csv``."""
     protocol, seeds = experiment.protocol, experiment.seeds
-    trials = run_trials(protocol, seeds, folder / "runs", processes, on_done)
     report = protocol.report(seeds, trials, folder)
     report.empty = not (trials["motions"] > 0).any()
     if report.empty:  # errors and ratios of turns that nobody made mean nothing
         report.summary, report.figures = f"Nothing was turned. {why(trials)}", []
         report.tables = [table for table in report.tables if table.name == "stop_reasons"]
-    report.summary += f" {protocol.setting}."
+    report.summary += f" {protocol}."
     if experiment.quick:
         report.title += ": a quick run"
         report.summary = f"A quick run shows that it works, and claims nothing. {report.summary}"
-    report.configuration = {
-        "experiment": dataclasses.asdict(protocol),  # pyright: ignore[reportArgumentType]
-        "seeds": list(seeds),
-        **protocol.setting.figures(),
-    }
+    report.configuration = {"seeds": list(seeds), **protocol.configuration()}
     report.write(folder)
     trials.to_csv(folder / "trials.csv", index=False)
     return report
-
-
-def run_trials(
-    protocol: Protocol,
-    seeds: Sequence[int],
-    folder: Path,
-    processes: int = 1,
-    on_done: Callable[[str], None] | None = None,
-) -> DataFrame:
-    """The trials of all sessions; finished ones stay in ``folder``."""
-    kept = run_jobs(protocol.run, protocol.jobs(seeds), folder, processes, on_done)
-    read = TrialRecord.from_json
-    results = {name: [read(figures) for figures in session] for name, session in kept.items()}
-    return trial_frame(results)
-
-
-def objects_of(names: str | Path) -> tuple[str, ...]:
-    """Names, or the URDF files of a folder, sorted.
-
-    Raises:
-        UnknownNameError: no folder, and no object has such a name; the message lists them.
-        ParameterError: there are no URDF files in the folder.
-        DescriptionError: one is faulty; the message names file and place.
-    """
-    folder = Path(names)
-    if not folder.is_dir() and not isinstance(names, Path):
-        chosen = tuple(dict.fromkeys(part.strip() for part in names.split(",") if part.strip()))
-        for name in chosen:
-            load_object(name)
-        return chosen
-    found = tuple(str(path) for path in sorted(folder.glob("*.urdf")))
-    if not found:
-        valid = "a folder with *.urdf files, each with its *.object.toml"
-        raise ParameterError("objects", str(folder), valid)
-    for path in found:  # what is wrong with one is said before anything runs
-        load_object(path)
-    return found

@@ -7,27 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..._extras import require
 from ..learners import OURS
-from ..reporting.plots import new_figure
+from ..reporting.plots import COLOURS, new_figure
 from .scores import Comparison
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _WINDOWS = 25  # of a learning curve
-_BLUE, _GREY = "#0072B2", "#7f7f7f"
+_BLUE, _GREY = COLOURS["E-KM"], COLOURS["KM"]
 _ALWAYS = {"model alone": _GREY, "default": _BLUE}
 _CYCLE = ("#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#000000")
 
 
-def colour_of(learner: str) -> str:
-    """Blue for ours, grey for all others."""
-    return _BLUE if learner in OURS else _GREY
-
-
 def plot_scores(comparison: Comparison) -> Figure:
-    """Error over that of the model alone, with 95 % intervals: a panel for each stream."""
+    """Error over that of the model alone, with 95 % intervals: a panel for each stream; ours are blue."""
     n = len(comparison.streams)
     columns = min(n, 3)
     rows = -(-n // columns)
@@ -38,7 +32,7 @@ def plot_scores(comparison: Comparison) -> Figure:
         scores, best = comparison.row(stream.name), comparison.best(stream.name)
         errors = [comparison.error(stream.name, score.learner) for score in scores]
         for i, (score, error) in enumerate(zip(scores, errors, strict=True)):
-            colour = colour_of(score.learner)
+            colour = _BLUE if score.learner in OURS else _GREY
             axis.plot([error.low, error.high], [i, i], color=colour, linewidth=1.6)
             filled = colour if score is best else "white"
             axis.plot(error.mean, i, "o", color=colour, markerfacecolor=filled, markersize=5.5)
@@ -77,31 +71,4 @@ def plot_learning_curves(
     axis.set(xlabel="sample", ylabel=f"{measure} error [{unit}]", ylim=(0, None))
     axis.set_title(f"{stream}: {one.about}", loc="left", fontsize=9)
     axis.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return figure
-
-
-def plot_cost(comparison: Comparison) -> Figure:
-    """Time for one sample against the geometric mean of the error ratios; the model alone is 1."""
-    figure, (axis,) = new_figure(7.5, 3.8)
-    points = []
-    for name in comparison.learners:
-        scores = [comparison.scores[stream.name, name] for stream in comparison.streams]
-        errors = [comparison.error(stream.name, name).mean for stream in comparison.streams]
-        time = float(np.median([score.microseconds for score in scores]))
-        ratio = float(np.exp(np.mean(np.log(np.maximum(errors, 1e-6)))))
-        if name != "model alone":
-            points.append((ratio, time, name))
-    style = {"textcoords": "axes fraction", "fontsize": 8, "va": "center"}
-    for place, (ratio, time, name) in enumerate(sorted(points)):  # names in a column: they would overlap
-        colour, height = colour_of(name), (place + 0.5) / len(points)
-        arrow = {"arrowstyle": "-", "color": colour, "alpha": 0.35, "linewidth": 0.7}
-        axis.annotate(name, (time, ratio), (1.03, height), color=colour, arrowprops=arrow, **style)
-        axis.plot(time, ratio, "o", color=colour)
-    axis.set_xscale("log")
-    ticker = require("matplotlib.ticker")
-    axis.xaxis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.xaxis.set_major_formatter(ticker.StrMethodFormatter("{x:g}"))
-    axis.xaxis.set_minor_formatter(ticker.NullFormatter())
-    axis.margins(x=0.1, y=0.08)
-    axis.set(xlabel="one prediction and one update [µs]", ylabel="error / model alone (geometric mean)")
     return figure

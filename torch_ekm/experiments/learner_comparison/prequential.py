@@ -19,16 +19,14 @@ _Z90 = 1.6448536269514722  # half width of a central 90 % interval of the normal
 class Prequential:
     """Predictions of each sample before it was learned, and what happened.
 
-    ``mean``, ``deviation`` (observation noise included) and ``y`` are ``(n, m)``; ``density`` is the log
-    density of y under the learner's predictive law, where that is not normal. ``seconds`` are those of
-    predictions and updates, without the density.
+    ``mean``, ``deviation`` (observation noise included) and ``y`` are ``(n, m)``; ``seconds`` are those of
+    predictions and updates.
     """
 
     mean: Float[Tensor, "n m"]
     deviation: Float[Tensor, "n m"]
     y: Float[Tensor, "n m"]
     seconds: float
-    density: Float[Tensor, "n m"] | None = None
 
     @property
     def error(self) -> Float[Tensor, "n m"]:
@@ -56,20 +54,12 @@ def run_prequential(
     It calls the learner's ``new_sequence`` between ``segments``, given by their lengths.
     """
     starts = set(itertools.accumulate(segments))
-    means, deviations, densities, seconds = [], [], [], 0.0
-    heavy = type(learner).predictive is not ResidualLearner.predictive
+    means, deviations, begin = [], [], time.perf_counter()
     for t in range(len(x)):
         if t in starts:
             learner.new_sequence()
-        begin = time.perf_counter()
         law = learner.predict(x[t], observation=True)
         means.append(law.mean.detach())
         deviations.append(law.stddev.detach())
-        predicted = time.perf_counter()
-        if heavy:
-            densities.append(learner.predictive(x[t]).log_prob(y[t]).detach())
-        asked = time.perf_counter()
         learner.update(x[t], y[t])
-        seconds += predicted - begin + time.perf_counter() - asked
-    density = torch.stack(densities) if heavy else None
-    return Prequential(torch.stack(means), torch.stack(deviations), y, seconds, density)
+    return Prequential(torch.stack(means), torch.stack(deviations), y, time.perf_counter() - begin)

@@ -15,8 +15,7 @@ import torch
 from ..._extras import require
 from ...exceptions import DescriptionError, EKMError, ParameterError, UnknownNameError
 from ...typing import Array
-from .own_recording import Columns, load_own
-from .stream import Stream, load_table
+from .stream import Columns, Stream, load_own, load_table
 
 LIMIT = 1500  #: samples of a recording that are used if nobody says otherwise
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..reporting.plots import save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from .plots import plot_cost, plot_learning_curves, plot_scores
+from .plots import plot_learning_curves, plot_scores
 from .scores import Comparison, Score
 
 
@@ -36,8 +36,6 @@ class ComparisonReport(Comparison):
             "the default learner and sparse online GPs; filled: the best of each stream."
         )
         figures = [save(plot_scores(self), name="scores", caption=caption)]
-        caption = "Error against the time of one prediction and one update: best at the lower left."
-        figures.append(save(plot_cost(self), name="cost", caption=caption))
         for stream in (s.name for s in self.streams):
             shown, n = curve_learners(self, stream), len(self.learners)
             some = f": {len(shown)} of {n} learners" if len(shown) < n else ""

@@ -1,19 +1,20 @@
-"""Streams, on which learners are compared: samples in the order of time, in units of their beginning."""
+"""Streams, on which learners are compared: samples in the order of time, from tables and recordings."""
 
 from __future__ import annotations
 
-import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from ...exceptions import DescriptionError, ParameterError, ShapeError
 from ...typing import Array, Float, Tensor
-from .table_file import find_columns, open_table
+from .table_file import Reader, find_columns, open_table
 
 _REST = 0.01  # of the deviation in all: less is rest
 LEAST = 40  #: samples; fewer do not distinguish learners
@@ -100,15 +101,6 @@ class Stream:
         unit = tuple(unit.tolist()) if self.outputs else ()
         return replace(self, x=inputs, y=targets, warm_up=warm_up, available=len(self), unit=unit)
 
-    def save(self, path: Path) -> Path:
-        """Write the samples as CSV: columns ``x1..xd, y1..ym``."""
-        names = [f"x{i + 1}" for i in range(self.x.shape[1])] + [f"y{i + 1}" for i in range(self.y.shape[1])]
-        with Path(path).open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.writer(stream)
-            writer.writerow(names)
-            writer.writerows(torch.cat([self.x, self.y], dim=1).tolist())
-        return Path(path)
-
 
 def load_table(
     path: str | Path,
@@ -153,21 +145,19 @@ def load_table(
         raise DescriptionError(path, "all columns are targets; at least one must be an input")
     if both := [name for name in chosen if name in outputs]:
         raise DescriptionError(path, f"column '{both[0]}' cannot be both input and target")
-    groups = [chosen, outputs, model, runs]  # read at once, so that holes are counted in all of them
-    rows = read([name for one in groups for name in one])
-    values = np.split(rows.values, np.cumsum([len(one) for one in groups[:-1]]), axis=1)
-    x, y = values[0], values[1] - (values[2] if model else 0.0)
+    (x, measured, said, number), _, notes = _together(read, [chosen, outputs, model, runs])
+    y = measured - (said if model else 0.0)
     if len(x) < LEAST:
-        few = f"it has {len(x)} samples; at least {LEAST} are needed to compare"
-        raise DescriptionError(path, f"{few}.{rows.about}" if rows.about else few)
+        raise DescriptionError(
+            path, f"it has {len(x)} samples; at least {LEAST} are needed to compare.{notes}"
+        )
     zero_is_model = bool(model) or all(map(_is_residual, outputs))
     alone = ", ".join(model) if model else "0" if zero_is_model else "the mean of the first tenth"
     about = f"{', '.join(outputs)} from {len(chosen)} columns of {Path(path).name}; alone: {alone}"
-    number = np.pad(values[3][:limit].sum(1), 1, constant_values=np.nan)  # zeros without runs
-    parts = np.diff(np.flatnonzero(np.diff(number))).tolist()
+    borders = np.diff(np.pad(number[:limit].sum(1), 1, constant_values=np.nan))  # zeros without runs
+    parts = np.diff(np.flatnonzero(borders)).tolist()
     if runs and 3 * len(parts) > len(x[:limit]):
         raise ParameterError("run", runs[0], "a column that is the same in all rows of a run")
-    notes = rows.about
     if clocks := [name for name, column in zip(chosen, x.T, strict=True) if _is_clock(column, len(parts))]:
         notes += f" Like a clock or the number of a row, to be left out: {', '.join(clocks)}."
     if numbers := [name for name, column in zip(chosen, x.T, strict=True) if _is_number_of_run(column)]:
@@ -176,6 +166,13 @@ def load_table(
     x, y = torch.from_numpy(x), torch.from_numpy(y)
     stream = Stream(Path(path).stem, x, y, about=about, notes=notes, outputs=tuple(names))
     return replace(stream.stream(limit, centre=not zero_is_model), segments=tuple(parts) if runs else ())
+
+
+def _together(read: Reader, groups: Sequence[Sequence[str]]) -> tuple[list[Array], NDArray[Any], str]:
+    """The columns of each group, read at once, so that holes are counted in all of them; parts, and notes."""
+    rows = read([name for one in groups for name in one])
+    ends = np.cumsum([len(one) for one in groups[:-1]])
+    return np.split(rows.values, ends, axis=1), rows.part, rows.about
 
 
 def _is_clock(column: Array, n_runs: int) -> bool:
@@ -208,3 +205,66 @@ def _proposed(names: Sequence[str]) -> str:
         return ""
     measured, predicted = (",".join(side) for side in zip(*pairs, strict=True))
     return f"; these look like pairs: --measured {measured} --predicted {predicted}"
+
+
+#: ``f(state, command) -> increment of the observation`` of all motions at once, ``(n, .)`` each.
+Model = Callable[[Array, Array], Array]
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Names of columns, or their beginnings with ``*`` at the end, such as ``/joint_states.position*``.
+
+    Attributes:
+        state: what is known before a motion.
+        command: what is asked of the motors, as a rate or an increment.
+        observation: what is to be predicted: its increment over the motion.
+    """
+
+    state: Sequence[str]
+    command: Sequence[str]
+    observation: Sequence[str]
+
+
+def load_own(
+    path: str | Path,
+    columns: Columns,
+    model: Model | None = None,
+    *,
+    clock: str | None = None,
+) -> Stream:
+    """Motions from CSV, Parquet, or a recording of ROS (MCAP, sqlite3, .bag), in the units of the file.
+
+    From each row to the next, ``y = o(t + 1) - o(t) - f(s(t), u(t))``; x holds state and command. Its
+    :meth:`Stream.stream` is what learners are compared on.
+
+    Args:
+        path: the file, or the folder of rosbag2; rows in the order of time. No motion goes over a row that
+            is left out, or from one run into another.
+        columns: which column is what.
+        model: f; None: nothing moves.
+        clock: in a recording of ROS, the topic whose messages set the rows, such as that of the commands.
+
+    Raises:
+        DescriptionError: the file cannot be used or is too short.
+        UnknownNameError: a column or topic is not there; the message lists them.
+        ParameterError: ``clock`` does not fit.
+        ShapeError: the model's increments have another shape than the observation.
+    """
+    path = Path(path)
+    names, read = open_table(path, clock)
+    groups = [find_columns(wanted, names) for wanted in vars(columns).values()]
+    (known, commanded, seen), part, notes = _together(read, groups)
+    starts = np.flatnonzero(part[1:] == part[:-1])  # no motion from one part into another
+    if len(starts) < LEAST:
+        raise DescriptionError(path, f"it has {len(starts)} motions; at least {LEAST} are needed.{notes}")
+    s, u, moved = known[starts], commanded[starts], seen[starts + 1] - seen[starts]
+    nominal = np.zeros_like(moved) if model is None else np.asarray(model(s, u), dtype=np.float64)
+    if nominal.shape != moved.shape:
+        hint = f"f gets all rows: state {s.shape}, command {u.shape}"
+        raise ShapeError("increments of the model", str(moved.shape), nominal.shape, hint)
+    alone = "nothing moves" if model is None else getattr(model, "__name__", type(model).__name__)
+    outputs = tuple(groups[-1])
+    about = f"increments of {len(outputs)} columns of {path.name}; alone: {alone}"
+    x, y = torch.from_numpy(np.hstack([s, u])), torch.from_numpy(moved - nominal)
+    return Stream(path.stem, x, y, about=about, notes=notes, outputs=outputs)

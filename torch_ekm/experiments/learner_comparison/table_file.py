@@ -41,9 +41,10 @@ class Rows(NamedTuple):
     """Which rows are left out and why, and what was found of clocks; sentences that begin with a blank."""
 
 
-def open_table(
-    path: Path, clock: str | None = None, label: str = ""
-) -> tuple[Names, Callable[[Sequence[str]], Rows]]:
+Reader = Callable[[Sequence[str]], Rows]
+
+
+def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[Names, Reader]:
     """Column names, and a function that reads some of the columns, rows in the order of time.
 
     CSV (``.csv``, ``.tsv``, ``.txt``), see :func:`open_csv`, or Parquet (``.parquet``), see

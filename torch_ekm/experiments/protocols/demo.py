@@ -14,7 +14,7 @@ from ...control import StopReason
 from ...description import load_hand, load_object
 from ...exceptions import EKMError
 from ...rendering import Told, make_scene, save_animation, save_picture
-from ..reporting.plots import plot_convergence, plot_prediction_error, save_figure
+from ..reporting.plots import plot_prediction_error, save_figure
 from ..reporting.report import FigureFile, Report
 from ..reporting.statistics import DataFrame
 from ..reporting.tables import group_table
@@ -24,23 +24,12 @@ from .generalize import Generalize
 
 @dataclass(frozen=True)
 class Demo(Generalize):
-    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and
-    with pictures.
-
-    Raises:
-        UnknownNameError: no such object; the message lists them.
-        DescriptionError: its files are missing or wrong.
-        ParameterError: an angle that is no rotation.
-    """
+    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and with pictures."""
 
     objects: tuple[str, ...] = ("box",)
     warm_up: int = 0
     controllers: tuple[str, ...] = ("KM", "E-KM")
     poses: bool = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        load_object(self.object)
 
     @property
     def object(self) -> str:
@@ -64,7 +53,7 @@ class Demo(Generalize):
         return report
 
     def _motions(self, turns: DataFrame, folder: Path) -> list[FigureFile]:
-        """How the prediction improves with each motion, and how the error falls in the longest turn."""
+        """How the prediction improves with each motion."""
         names, figures = ["prediction_ekm_deg", "prediction_km_deg"], []
         motions = select(turns, controller="E-KM").dropna(subset="prediction_ekm").explode(names)
         motions["motion"] = motions.groupby("seed").cumcount() + 1
@@ -79,10 +68,7 @@ class Demo(Generalize):
             )
             figure = plot_prediction_error(*curves, xlabel="motion")
             figures.append(save_figure(figure, folder, "prediction_error", caption))
-        last = self.angles_of(self.object)[-1]
-        figure = plot_convergence(select(turns, angle_deg=last), f"{last:g} deg")
-        caption = f"Measured error on the way to {last:g} deg: a line for each grasp."
-        return [*figures, save_figure(figure, folder, "convergence", caption)]
+        return figures
 
     def _pictures(self, turns: DataFrame, folder: Path) -> list[FigureFile]:
         """The E-KM's best long turn: before and after, and as an animation."""

@@ -11,6 +11,7 @@ from typing import Self
 
 import numpy as np
 
+from ...description import load_object
 from ...exceptions import ParameterError
 from ..config import CONTROLLERS, Setting, digest, object_name
 from ..records import TrialRecord
@@ -60,7 +61,8 @@ class Generalize(Protocol):
 
     Raises:
         ParameterError: no object, or an angle that is no rotation.
-        UnknownNameError: no such controller; the message lists them.
+        UnknownNameError: no such object or controller; the message lists them.
+        DescriptionError: files of an object are missing or wrong.
     """
 
     setting: Setting = field(default_factory=Setting)
@@ -78,6 +80,7 @@ class Generalize(Protocol):
         if not self.objects:
             raise ParameterError("objects", self.objects, "at least one object")
         for name in self.objects:
+            load_object(name)
             angles = self.angles_of(name)
             if not angles or not all(0 < abs(angle) < 180 for angle in angles):
                 raise ParameterError("angles_deg", self.angles_deg, "angles between 0 and 180 deg")

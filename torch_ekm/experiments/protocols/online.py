@@ -10,6 +10,7 @@ from typing import Self
 
 import numpy as np
 
+from ..._extras import require
 from ...exceptions import ParameterError
 from ...simulation import PlantChange, Tug
 from ..config import CONTROLLERS, Setting, digest, object_name
@@ -17,7 +18,7 @@ from ..records import TrialRecord
 from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import LEAST_SEEDS, DataFrame, Series, bootstrap_mean, learning_curve
+from ..reporting.statistics import LEAST_SEEDS, DataFrame, bootstrap_mean, learning_curve
 from ..reporting.trials import select
 from ..runner import Bench
 from .protocol import Protocol
@@ -117,7 +118,6 @@ class Online(Protocol):
         shown = [
             self.paper_table(trials),
             tables.reason_table(trials),
-            self.learning_table(trials),
             tables.prediction_table(trials),
             tables.controller_table(trials),
         ]
@@ -131,83 +131,55 @@ class Online(Protocol):
     def paper_table(self, trials: DataFrame) -> Table:
         """The figures that the paper prints, next to those found here."""
         ekm, km = prediction_curves(trials, self.trials)
-        learned = [Learning.of(ekm.loc[seed], km.loc[seed], self.events) for seed in ekm.index]
+        learned = learning(ekm, km, self.events)
         rows: list[list[Cell]] = []
         for name, what, paper in (
             ("last_negative", "trials until significant (last index of negative result)", "16"),
             ("last_upper", "last upper boundary [deg]", "-0.57"),
+            ("late", f"E-KM:KM after {_LEARNED} trials", None),
+            *(
+                (f"after_{event}", f"trials until recovered after trial {event}", None)
+                for event in self.events
+            ),
         ):
-            found = np.array([x for one in learned if (x := getattr(one, name)) is not None], dtype=float)
+            found = learned[name].dropna().to_numpy()
             rows.append([what, paper, bootstrap_mean(found) if len(found) else None, len(found)])
         hands = [(ekm.loc[seed].dropna(), km.loc[seed].dropna()) for seed in ekm.index]
         rows += [[*row, len(ekm)] for row in tables.p_rows(hands, *tables.prediction_means(trials), "< 0.05")]
         columns = ["figure", "paper", Column("here, mean over seeds", ".2f"), "seeds"]
         note = (
-            "After how many trials the E-KM predicts better for good, and by how much at least at the end. "
-            "1: it predicts better from the first test on, which needs two trials."
+            "Means over the seeds that have one. After how many trials the E-KM predicts better for good (1: "
+            "from the first test on, which needs two), and by how much at least at the end. Recovered: its "
+            "error is below half of the KM's; trials with an event are left out of the ratio."
         )
         return Table("paper", "Figures of the paper and those found here", columns, rows, note)
 
-    def learning_table(self, trials: DataFrame) -> Table:
-        """How fast the E-KM learns (the paper's Fig. 5b), for each seed and for the mean over seeds."""
-        ekm, km = prediction_curves(trials, self.trials)
-        items = {str(seed): (ekm.loc[seed], km.loc[seed]) for seed in ekm.index}
-        if len(ekm) > 1:
-            items["of the seeds' mean errors"] = ekm.mean(), km.mean()
-        rows: list[list[Cell]] = []
-        for name, curves in items.items():
-            one = Learning.of(*curves, self.events)
-            back = ["never" if n is None else n or None for n in one.recovery]
-            rows.append([name, one.last_negative, one.last_upper, one.late, *back])
-        columns = [
-            "seed", "last negative result [trial]", "last upper boundary [deg]",
-            Column("E-KM:KM after 16 trials [%]", ".0f", percent=True),
-            *(f"recovered after trial {event} [trials]" for event in self.events),
-        ]  # fmt: skip
-        note = (
-            "Per-trial means of the one-step prediction error. Last negative result: last k with p(k) > 0.05 "
-            "(the paper: 16; last upper boundary -0.57 deg). Recovered: trials after the event until the "
-            "E-KM's error is below half of the KM's; trials with an event are left out of the ratio."
-        )
-        return Table("learning", "How fast the E-KM learns: errors against measurements", columns, rows, note)
 
+def learning(ekm: DataFrame, km: DataFrame, events: Sequence[int]) -> DataFrame:
+    """How fast learners learned: a row for each seed, NaN where there were too few trials to say.
 
-@dataclass(frozen=True)
-class Learning:
-    """How fast one learner learned; None where there were too few trials to say."""
+    =============  ==================================================================================
+    last_negative  last k for which the first k trials show no advantage
+    last_upper     upper end of the last one-sided interval of E-KM minus KM [deg]
+    late           E-KM : KM after 16 trials, without those with an event
+    after_20, ...  trials after the event of trial 20 until the E-KM's error is below half of the KM's
+    =============  ==================================================================================
 
-    last_negative: int | None
-    """Last k for which the first k trials show no advantage."""
-    last_upper: float | None
-    """Upper end of the last one-sided interval of E-KM minus KM [deg]."""
-    late: float | None
-    """E-KM : KM after 16 trials, without those with an event."""
-    recovery: tuple[int | None, ...]
-    """Trials after each event until the E-KM's error is below half of the KM's; None: never, 0: there was
-    no trial after it."""
-
-    @classmethod
-    def of(cls, ekm: Series, km: Series, events: Sequence[int]) -> Learning:
-        """From prediction errors of every trial [deg], NaN where nothing moved."""
-        # NaN: nothing moved, and nothing was recovered
-        recovery = tuple(recovery_trials(ekm, km, event) if event < ekm.index[-1] else 0 for event in events)
-        ekm = ekm.dropna()
-        km = km[ekm.index]
-        calm = ekm.index[(ekm.index > _LEARNED) & ~ekm.index.isin(events)]
-        late = float(ekm[calm].mean() / km[calm].mean()) if len(calm) else None
-        if len(ekm) < 2:
-            return cls(None, None, late, recovery)
-        curve = learning_curve(ekm.to_numpy(), km.to_numpy())
-        return cls(curve.last_negative, curve.last_upper, late, recovery)
-
-
-def recovery_trials(ekm: Series, km: Series, event: int) -> int | None:
-    """Trials after trial ``event`` until the E-KM's error is below half of the KM's.
-
-    1: already in the next trial; None: not within the recording.
+    Args:
+        ekm, km: of :func:`prediction_curves`.
+        events: trials.
     """
-    better = ekm.index[(ekm < 0.5 * km) & (ekm.index > event)]
-    return int(better[0]) - event if len(better) else None
+    rows = {}
+    for seed in ekm.index:
+        both = require("pandas").DataFrame({"ekm": ekm.loc[seed], "km": km.loc[seed]}).dropna()
+        calm = both[(both.index > _LEARNED) & ~both.index.isin(events)].mean()
+        rows[seed] = dict.fromkeys(("last_negative", "last_upper"), np.nan) | {"late": calm.ekm / calm.km}
+        if len(both) > 1:
+            curve = learning_curve(both["ekm"].to_numpy(), both["km"].to_numpy())
+            rows[seed] |= {"last_negative": curve.last_negative, "last_upper": curve.last_upper}
+        better = both.index[both["ekm"] < 0.5 * both["km"]]
+        rows[seed] |= {f"after_{event}": (better[better > event] - event).min() for event in events}
+    return require("pandas").DataFrame.from_dict(rows, orient="index").astype(float)
 
 
 def prediction_curves(trials: DataFrame, n: int) -> tuple[DataFrame, DataFrame]:

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -31,7 +32,7 @@ class Protocol(ABC):
         """The jobs of these seeds: name -> arguments of :meth:`session`."""
 
     @abstractmethod
-    def session(self, *arguments: Any) -> Sequence[TrialRecord]:
+    def session(self, *arguments: Any) -> Iterable[TrialRecord]:
         """Trials that belong together, one after the other; the results of different sessions are
         independent."""
 
@@ -42,6 +43,14 @@ class Protocol(ABC):
         Args:
             trials: of all sessions, see :func:`~torch_ekm.experiments.reporting.trials.trial_frame`.
         """
+
+    def __str__(self) -> str:
+        """Which plant, for the summary of a report."""
+        return str(self.setting)
+
+    def configuration(self) -> dict[str, Any]:
+        """All that decides the results, but the seeds."""
+        return {"experiment": dataclasses.asdict(self), **self.setting.figures()}  # pyright: ignore[reportArgumentType]
 
     def run(self, *arguments: Any) -> list[dict[str, Any]]:
         """Run :meth:`session`; its records in terms that JSON can keep."""

@@ -132,16 +132,3 @@ def plot_steady_state_error(turns: DataFrame) -> Figure:
     drawn = dict(zip(*reversed(panels[0].get_legend_handles_labels()), strict=True))
     figure.legend(drawn.values(), drawn.keys(), frameon=False, loc="outside upper right", ncols=4)
     return figure
-
-
-def plot_convergence(turns: DataFrame, target: str = "") -> Figure:
-    """Measured error over the motions of each turn [deg], a line for each."""
-    figure, (axis,) = new_figure(6.0, 3.4)
-    for j, (name, runs) in enumerate(turns.groupby("controller", sort=False)["errors_deg"]):
-        colour = COLOURS.get(str(name), f"C{j}")
-        for i, run in enumerate(runs):
-            axis.plot(run, color=colour, alpha=0.6, linewidth=1.1, label=name if i == 0 else None)
-    axis.set(xlabel="motion", ylabel="measured error [deg]", ylim=(0, None))
-    axis.set_title(f"Error on the way{' to ' + target if target else ''}", loc="left")
-    axis.legend(frameon=False)
-    return figure

@@ -120,9 +120,9 @@ class FigureFile:
 class Report:
     """A report shows what came of a run.
 
-    ``write`` leaves ``index.html``, the same as ``report.md``, one CSV for each table, ``report.json`` with
-    the texts, and ``configuration.json`` with the exact configuration, versions and seeds. On the page the
-    answer comes first, then the leading tables, the figures, and the other tables, folded.
+    ``write`` leaves ``index.html``, the same as ``report.md``, one CSV for each table, and
+    ``configuration.json`` with the exact configuration, versions and seeds. On the page the answer comes
+    first, then the leading tables, the figures, and the other tables, folded.
     """
 
     title: str
@@ -148,12 +148,6 @@ class Report:
         configuration = json.dumps({**self.configuration, "versions": versions()}, indent=2, sort_keys=True)
         with told_as_output_error(folder):
             (folder / "configuration.json").write_text(configuration + "\n", encoding="utf-8")
-            texts = {key: getattr(self, key) for key in ("title", "summary", "legend")}
-            tables = [
-                {key: getattr(table, key) for key in ("name", "caption", "note")} for table in self.tables
-            ]
-            texts |= {"figures": [vars(figure) for figure in self.figures], "tables": tables}
-            (folder / "report.json").write_text(json.dumps(texts, indent=1) + "\n", encoding="utf-8")
             for table in self.tables:
                 with (folder / f"{table.name}.csv").open("w", newline="", encoding="utf-8") as stream:
                     csv.writer(stream).writerows([table.header, *table.text()])
