@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,9 @@ from made_hands import write_hand
 from other_hands import main
 
 from torch_ekm.description import load_hand
-from torch_ekm.simulation import SimulatedHand
+from torch_ekm.model import KinematicModel, ModelOptions
+from torch_ekm.model.softening import softened
+from torch_ekm.simulation import PlantConfig, SimulatedHand
 
 KINDS = {"tendon_springs": 0.05, "not_round": 0.05, "four_bar": 0.25, "idle": 0.05, "coupled": 0.15}
 """And how much of the planned force may be missing: loops give way a little."""
@@ -46,6 +49,24 @@ def test_a_planned_pinch_holds_as_planned(kind: str, engine: str, tmp_path: Path
     assert moved.fingertip_force is not None
     assert float((moved.fingertip_force - truth.fingertip_force).abs().max()) > 0.05
     plant.close()
+
+
+def test_a_grasp_that_its_force_makes_soft_is_planned_with_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = SimulatedHand("icub_right", "can", engine="mujoco")
+    seen = plant.reset(0)
+    assert np.linalg.norm(plant.plan.forces[0]) == pytest.approx(5.0, rel=0.02)
+    model = KinematicModel(plant.hand, plant.object, ModelOptions(on_unstable="flag"))
+    lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    names = "mu", "force", "normal", "spin_moment"
+    tenfold = replace(lin.forces, **{name: 10 * getattr(lin.forces, name) for name in names})
+    assert not softened(model, lin)
+    assert softened(model, model.linearize(seen.state, lin.contacts, forces=tenfold))
+    monkeypatch.setattr("torch_ekm.simulation.simulated_hand.softened", lambda model, lin: True)
+    plant.reset(0)
+    assert np.linalg.norm(plant.plan.forces[0]) == pytest.approx(3.0, rel=0.02)
+    asked = SimulatedHand("icub_right", "can", PlantConfig(pinch_force=5.0), engine="mujoco")
+    asked.reset(0)
+    assert np.linalg.norm(asked.plan.forces[0]) == pytest.approx(5.0, rel=0.02)
 
 
 def test_the_benchmark_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

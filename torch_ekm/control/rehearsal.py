@@ -13,6 +13,7 @@ import torch
 from .._noise import DEGREE
 from ..exceptions import GraspError, NoContactError, UnstableGraspError
 from ..kinematics import GraspState
+from ..model.softening import softened
 from ..plant import Observation
 from ..typing import Tensor
 from .bands import lets_go
@@ -30,8 +31,6 @@ _MOST = 60  # pieces
 LONGEST = 60 * DEGREE  # [rad] of an actuator in one movement: what follows is planned when it is there
 _BENDS = 0.25 * DEGREE  # of a piece beyond its linearization: it is chosen once more, about where it leads
 _HALVES = 3  # times that a piece is tried
-_SOFTENS = 0.85  # of the stiffness without forces, below which a grasp is gripped no harder
-_FORCES = "mu", "force", "normal", "spin_moment"
 _GRIPPED = 0.95  # of the wanted grip
 _STOP_BEARS = 0.01  # [N m] of a joint's stop that ends a turn
 _SLIDES = 0.05  # of its friction, that a pad at its limit has to spare
@@ -155,10 +154,7 @@ class Rehearsal:
     def _bears(self, lin: Linearization) -> float:
         """The hardest grip [N]: the present one where its forces have made the grasp soft; with more it would
         buckle."""
-        forces = dataclasses.replace(lin.forces, **{name: 0 * getattr(lin.forces, name) for name in _FORCES})
-        free = self.hand.kinematic.linearize(lin.state, lin.contacts, forces=forces, on_unstable="flag")
-        soft = float(lin.stability) < _SOFTENS * float(free.stability)
-        return float(lin.forces.normal.max()) if soft else math.inf
+        return float(lin.forces.normal.max()) if softened(self.hand.kinematic, lin) else math.inf
 
     def _there(self, state: GraspState) -> bool:
         return self._target is not None and self._controller.focus.error(self._target, state) <= _THERE

@@ -109,7 +109,8 @@ class HandDescription:
     """Nominal gravity in the hand frame [m/s^2], that of plant and model unless one is set otherwise. The
     iCub's palm faces down: its fingers hang, and the line of a pinch is level."""
     pinch_force: float = 5.0
-    """Normal force with which the thumb pinches an object in simulation [N]; soft springs bear less."""
+    """Normal force with which the thumb pinches an object in simulation [N]; 3 N where this is more than the
+    springs bear."""
 
     notes: tuple[str, ...] = ()
     """What an MJCF says that is left out or approximated here."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 from collections.abc import Callable
@@ -15,6 +16,8 @@ from .._checks import check_count, check_kind
 from ..description import HandDescription, ObjectDescription, load_hand, load_object
 from ..exceptions import EquilibriumError, GraspError, ParameterError, StateError, UnknownNameError
 from ..kinematics import GraspState
+from ..model import KinematicModel, ModelOptions
+from ..model.softening import softened
 from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
@@ -30,6 +33,7 @@ from .presets import preset as parameters_of
 from .sensors import Sensors
 
 _ATTEMPTS = 5
+_GENTLE = 3.0  # [N] of a pinch whose springs are too soft for the usual force
 _LONGEST_REST = 0.8  # [s] that rest is waited for after a motion
 _FAR = 0.05  # [m] from where it was grasped: out of the hand
 _OFFSET_ALONG, _OFFSET_ACROSS = 0.010, 0.002  # [m]: grasp points are drawn within +- these, object's axes
@@ -127,7 +131,7 @@ class SimulatedHand:
         for _ in range(_ATTEMPTS):
             request = self._request()
             try:
-                plan = remembered_pinch(self._problem, request)
+                plan = self._planned(request)
             except EquilibriumError as refused:
                 unplanned += 1
                 if unplanned == 2 or not self._graspable(request, refused):
@@ -299,6 +303,29 @@ class SimulatedHand:
         self._sensors.set_parameters(parameters)
         if self._rig is not None:
             self._rig.change(parameters)
+
+    def _planned(self, request: PinchRequest) -> PinchPlan:
+        """The pinch that is wanted, or a gentler one where its force makes the grasp soft.
+
+        Raises:
+            EquilibriumError: as of :func:`remembered_pinch`.
+        """
+        plan = remembered_pinch(self._problem, request)
+        if self.config.pinch_force is None and request.force > _GENTLE and self._softened(plan):
+            with contextlib.suppress(EquilibriumError):
+                return remembered_pinch(self._problem, dataclasses.replace(request, force=_GENTLE))
+        return plan
+
+    def _softened(self, plan: PinchPlan) -> bool:
+        """Its forces have made the grasp soft, as far as the model knows it."""
+        model = KinematicModel(self.hand, self.object, ModelOptions(on_unstable="flag"))
+        named = dict(zip(plan.pads, -np.einsum("ci,ci->c", plan.forces, plan.normals), strict=True))
+        (force,) = _tensors(np.array([named.get(pad.name, 0.0) for pad in self.hand.pads]))
+        try:
+            state = GraspState(*_tensors(plan.q, plan.position, plan.rotation))
+            return softened(model, model.linearize(state, fingertip_force=force))
+        except GraspError:
+            return False
 
     def _graspable(self, request: PinchRequest, refused: EquilibriumError) -> bool:
         """Some pinch is known, or the centred one exists; what has none is refused from then on."""
