@@ -260,7 +260,7 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
             result = journal.resume(loop)
         except EKMError as error:
             return written["motions"], type(error).__name__
-    kept = written["learned"]["knowledge"]["servo.weight"]
+    kept = written["learned"]["knowledge.servo.weight"]
     assert not (written["motions"] and learns and torch.equal(kept, forgotten)), "nothing was kept"
     assert recorded.after, "it does not hold"
     assert not bool(recorded.sent[0].any()), "it does not hold first"

@@ -148,7 +148,7 @@ def test_the_command_line_compares_and_copies_with_the_extra_plots_alone(tmp_pat
     assert (tmp_path / "out" / "index.html").is_file()
     assert len(list((tmp_path / "copies").glob("*.ipynb"))) >= 6
     assert "torch-ekm" in copied_and_told.split("$ --version")[1]
-    assert "pip install 'torch_ekm[experiments]'" in done.stderr
+    assert "pip install 'torch_ekm[robot]'; all commands run with extra 'experiments'" in done.stderr
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
