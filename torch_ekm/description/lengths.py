@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from .._extras import require
 from ..typing import Array
 
 _STEP = 1e-5  # [rad] of differences between moment arms
@@ -16,20 +17,24 @@ _LEAST = 0.1  # of the largest arm of a joint's range: a mean arm below it is no
 _SAMPLES = 33  # angles of a joint's range at which arms are compared
 
 
-class ArmFunction(NamedTuple):
-    """A moment arm over its joint's angle, in pieces: ``arm(q) = sum_k c_k (q - origin)^k``."""
+class ArmFunction:
+    """A moment arm over its joint's angle, with its integral from 0 and its slope: ``scipy`` polynomials.
 
-    knots: Array
-    """Angles at which one piece ends and the next begins, ``(m,)`` [rad]."""
-    origin: Array
-    """``(m + 1,)`` [rad]."""
-    coefficients: Array
-    """``(m + 1, degree + 1)``, lowest power first."""
+    Args:
+        arm: the arm [rad/rad] or [m].
+        ends: between which it holds; it is straight beyond them.
+    """
+
+    def __init__(self, arm: Any, ends: tuple[float, float] = (-np.inf, np.inf)) -> None:
+        self._ends, self._parts = ends, (arm.antiderivative(), arm, arm.derivative())
+        self._start = 0.0
+        self._start = float(self(np.zeros(()))[0])
 
     @classmethod
     def polynomial(cls, coefficients: Sequence[float]) -> ArmFunction:
         """``arm(q) = sum_k c_k q^k``."""
-        return cls(np.zeros(0), np.zeros(1), np.array([coefficients], dtype=np.float64))
+        made = require("scipy.interpolate").PPoly(np.array(coefficients)[::-1, None], [0.0, 1.0])
+        return cls(made)
 
     @classmethod
     def table(cls, angle: Sequence[float], arm: Sequence[float]) -> ArmFunction:
@@ -39,25 +44,19 @@ class ArmFunction(NamedTuple):
             angle: two or more, increasing [rad].
             arm: there.
         """
-        x, y = np.array(angle, dtype=np.float64), np.array(arm, dtype=np.float64)
-        n, step, slope = len(x), np.diff(x), np.diff(y) / np.diff(x)
-        M, right = np.eye(n), np.zeros(n)  # of the second derivatives at the knots
-        for k in range(1, n - 1):
-            M[k, k - 1 : k + 2] = step[k - 1] / 6, (step[k - 1] + step[k]) / 3, step[k] / 6
-            right[k] = slope[k] - slope[k - 1]
-        bend = np.linalg.solve(M, right)
-        inner = np.stack(
-            [y[:-1], slope - step * (2 * bend[:-1] + bend[1:]) / 6, bend[:-1] / 2, np.diff(bend) / (6 * step)]
-        ).T
-        first = [y[0], inner[0, 1], 0.0, 0.0]
-        last = [y[-1], slope[-1] + step[-1] * (bend[-2] + 2 * bend[-1]) / 6, 0.0, 0.0]
-        return cls(x, np.concatenate([x[:1], x]), np.vstack([first, inner, last]))
+        made = require("scipy.interpolate").CubicSpline(angle, arm, bc_type="natural")
+        return cls(made, (angle[0], angle[-1]))
+
+    def __call__(self, q: Array) -> tuple[Array, Array, Array]:
+        """Integral from 0, arm and slope at these angles [rad]."""
+        at = np.clip(q, *self._ends)
+        (whole, arm, slope), beyond = (part(at) for part in self._parts), q - at
+        return whole + beyond * (arm + 0.5 * beyond * slope) - self._start, arm + beyond * slope, slope
 
     def typical(self, lower: float, upper: float) -> float:
         """The mean arm over a joint's range, which makes its stroke right; where it is next to nothing, the
         largest."""
-        low, high = max(lower, -np.pi), min(upper, np.pi)
-        arms = _evaluate(_stacked([self]), np.linspace(low, high, _SAMPLES)[:, None])[1][:, 0]
+        arms = self(np.linspace(max(lower, -np.pi), min(upper, np.pi), _SAMPLES))[1]
         mean, largest = float(arms.mean()), float(arms[np.abs(arms).argmax()])
         return mean if abs(mean) > _LEAST * abs(largest) else largest
 
@@ -90,10 +89,6 @@ class Lengths:
         return not (self.functions or self.routed)
 
     @cached_property
-    def _curves(self) -> _Curves:
-        return _stacked([function for *_, function in self.functions])
-
-    @cached_property
     def _at(self) -> tuple[list[int], list[int]]:
         return [row for row, *_ in self.functions], [joint for _, joint, _ in self.functions]
 
@@ -104,7 +99,7 @@ class Lengths:
         if self.functions:
             rows, joints = self._at
             share = arms[rows, joints] / self.typical[rows, joints]
-            more = share * _evaluate(self._curves, q[..., joints])[0] - arms[rows, joints] * q[..., joints]
+            more = share * self._evaluated(q[..., joints])[0] - arms[rows, joints] * q[..., joints]
             for k, row in enumerate(rows):
                 found[..., row] += more[..., k]
         for rows, routed in self.routed:
@@ -117,7 +112,7 @@ class Lengths:
         found = np.ones((*q.shape[:-1], *self.typical.shape))
         if self.functions:
             rows, joints = self._at
-            arm = _evaluate(self._curves, q[..., joints])[1]
+            arm = self._evaluated(q[..., joints])[1]
             found[..., rows, joints] = arm / self.typical[rows, joints]
         for rows, routed in self.routed:
             at = list(rows)
@@ -136,7 +131,7 @@ class Lengths:
         found = np.zeros((*q.shape[:-1], *self.typical.shape, n_q))
         if self.functions:
             rows, joints = self._at
-            bend = _evaluate(self._curves, q[..., joints])[2]
+            bend = self._evaluated(q[..., joints])[2]
             found[..., rows, joints, joints] = bend / self.typical[rows, joints]
         for rows, routed in self.routed:
             at, shift = list(rows), _STEP * np.eye(n_q)
@@ -166,58 +161,17 @@ class Lengths:
         mixed = low + np.random.default_rng(0).uniform(size=(_SAMPLES, len(low))) * (high - low)
         return np.abs(self.ratio(np.concatenate([straight, mixed]))).max(axis=0)
 
+    def _evaluated(self, q: Array) -> Array:
+        """Integrals, arms and slopes of the functions at their joints' angles, ``(3, *batch, n)``."""
+        each = [function(q[..., k]) for k, (*_, function) in enumerate(self.functions)]
+        return np.moveaxis(np.array(each), 0, -1)
+
     def _shares(self, arms: Array) -> Array:
         """How long each tendon is against the typical one ``(n,)``."""
         square = (self.typical**2).sum(axis=1)
         return np.divide(
             (arms * self.typical).sum(axis=1), square, out=np.ones_like(square), where=square > 0
         )
-
-
-class _Curves(NamedTuple):
-    """Functions of as many pieces and powers, ``(n, ...)``, as :class:`ArmFunction` has them."""
-
-    knots: Array
-    origin: Array
-    coefficients: Array
-    before: Array
-    """Integral from 0 to the origin of each piece ``(n, m + 1)``."""
-
-
-def _stacked(functions: list[ArmFunction]) -> _Curves:
-    pieces = max(len(one.origin) for one in functions)
-    powers = max(one.coefficients.shape[1] for one in functions)
-    knots, origin = np.full((len(functions), pieces - 1), np.inf), np.zeros((len(functions), pieces))
-    coefficients = np.zeros((len(functions), pieces, powers))
-    for k, one in enumerate(functions):
-        knots[k, : len(one.knots)], origin[k, : len(one.origin)] = one.knots, one.origin
-        coefficients[k, : len(one.origin), : one.coefficients.shape[1]] = one.coefficients
-    before = np.zeros_like(origin)
-    raised = coefficients / np.arange(1, powers + 1)
-    for p in range(1, pieces):
-        step = np.where(np.isfinite(knots[:, p - 1]), knots[:, p - 1], 0.0)
-        end = _polynomial(raised[:, p - 1], step - origin[:, p - 1]) * (step - origin[:, p - 1])
-        start = _polynomial(raised[:, p], step - origin[:, p]) * (step - origin[:, p])
-        before[:, p] = before[:, p - 1] + end - start
-    curves = _Curves(knots, origin, coefficients, before)
-    return curves._replace(before=before - _evaluate(curves, np.zeros(len(functions)))[0][:, None])
-
-
-def _evaluate(curves: _Curves, q: Array) -> tuple[Array, Array, Array]:
-    """Integrals from 0, arms and their slopes at the angles of each function's joint ``(*batch, n)``."""
-    piece = (q[..., None] >= curves.knots).sum(axis=-1)
-    at = np.arange(q.shape[-1]), piece
-    t, c = q - curves.origin[at], curves.coefficients[at]
-    power = np.arange(c.shape[-1])
-    slope = _polynomial(c[..., 1:] * power[1:], t)
-    return curves.before[at] + _polynomial(c / (power + 1), t) * t, _polynomial(c, t), slope
-
-
-def _polynomial(c: Array, t: Array) -> Array:
-    found = np.zeros_like(t)
-    for k in reversed(range(c.shape[-1])):
-        found = found * t + c[..., k]
-    return found
 
 
 def _each(routed: Routed, q: Array) -> tuple[Array, Array]:

@@ -29,7 +29,6 @@ _SETTINGS = {  # ... and of elements that only set something, all that is
     "default": {"class"},
     "compiler": {"angle", "autolimits", "eulerseq", "inertiafromgeom", "inertiagrouprange"} | _BOUNDS.keys(),
 }
-_MESHES = ("mesh", "hfield", "sdf")  # types of a geom
 
 
 def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
@@ -50,13 +49,19 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
         if element.tag in _READ:
             strict.append(element)
     notes = [listed("files outside the folder are not read", reader.left_out)] if reader.left_out else []
-    meshes, total = _take_out_meshes(strict), "-1"
+    total = "-1"
     for element in strict.iter():
         total = element.get("settotalmass", total)
         _strip(path, element)
     mujoco = require("mujoco")
+    kinds = mujoco.mjtGeom.mjGEOM_MESH, mujoco.mjtGeom.mjGEOM_HFIELD, mujoco.mjtGeom.mjGEOM_SDF
     try:
-        model = mujoco.MjModel.from_xml_string(ET.tostring(strict, encoding="unicode"))
+        spec = mujoco.MjSpec.from_string(ET.tostring(strict, encoding="unicode"))
+        drawn = [geom for geom in spec.geoms if geom.meshname or geom.type in kinds]
+        meshes = {geom.parent.name for geom in drawn}
+        for geom in drawn:  # no mesh is read
+            spec.delete(geom)
+        model = spec.compile()
         if float(total) > 0:  # MuJoCo complains of the attribute
             mujoco.mj_setTotalmass(model, float(total))
         return model, meshes, notes
@@ -125,48 +130,6 @@ class _Reader:
                 raise DescriptionError(path, "an <include> has no file")
             place = list(element).index(child)
             element[place : place + 1] = list(self.read(self.folder / file, above))
-
-
-def _take_out_meshes(root: ET.Element) -> set[str]:
-    """Take out the geoms that are meshes, by themselves or by their class; the bodies that had any.
-
-    A geom's class is its own, or the ``childclass`` of the nearest body that has one.
-    """
-    classes, bodies = _mesh_classes(root), set()
-    inside = [(element, "", "") for element in root if element.tag != "default"]
-    for element, named, body in inside:
-        named = element.get("childclass", named)
-        body = element.get("name", "") if element.tag == "body" else body
-        for child in list(element):
-            has, needs = classes.get(child.get("class", named), (False, False))
-            needs = child.get("type") in _MESHES if "type" in child.attrib else needs
-            if child.tag != "geom":
-                inside.append((child, named, body))
-            elif has or needs or "mesh" in child.attrib:
-                bodies.add(body)
-                element.remove(child)
-    return bodies
-
-
-def _mesh_classes(root: ET.Element) -> dict[str, tuple[bool, bool]]:
-    """Of each default class: whether its geoms have a mesh, and whether they are of a type that needs one.
-
-    Both leave the defaults, so that MuJoCo looks for no mesh.
-    """
-    classes = {"": (False, False)}
-    inside = [(default, "") for default in root.findall("default")]
-    for default, above in inside:
-        name = default.get("class", "")
-        name = "" if name == "main" else name
-        has, needs = classes.get(name, classes[above])
-        for geom in default.findall("geom"):
-            has = geom.attrib.pop("mesh", None) is not None or has
-            needs = geom.get("type") in _MESHES if "type" in geom.attrib else needs
-            if geom.get("type") in _MESHES:
-                del geom.attrib["type"]
-        classes[name] = has, needs
-        inside += [(child, name) for child in default.findall("default")]
-    return {**classes, "main": classes[""]}
 
 
 def _strip(path: Path, element: ET.Element) -> None:
