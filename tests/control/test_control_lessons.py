@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 
 import pytest
@@ -129,3 +130,22 @@ def test_a_motion_is_a_path_of_one_piece(held, pieces) -> None:
     for name, value in one.state_dict().items():
         torch.testing.assert_close(value, other.state_dict()[name], rtol=0, atol=1e-14)
     assert float(one.mean.abs().max()) > 0.1
+
+
+@pytest.mark.parametrize(("less", "learns"), [(0.3, True), (4.0, False)])
+def test_a_finger_that_slid_or_gave_its_load_away_says_nothing_of_forces(held, less, learns) -> None:
+    seen, axis, model = held
+    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+    loop = ClosedLoop(Obedient(model, seen), controller)
+    target = PoseTarget.turned(seen.state, axis, degrees=5)
+    decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
+    expected = controller.expect(decision.pieces, decision.delta_a)
+    assert expected.normal is not None
+    state, force = seen.state.plus(expected.increment), expected.normal.nan_to_num()
+    force[0] -= less
+    after = dataclasses.replace(
+        seen, q=state.q, position=state.position, rotation=state.rotation, fingertip_force=force
+    )
+    lessons = Lessons(controller, loop.knowledge, loop.knowledge.figures)
+    lessons.learn(seen, decision, after, decision.delta_a, expected)
+    assert bool(loop.knowledge.forces.evidence.any()) is learns

@@ -103,7 +103,7 @@ class Lessons:
             moved = decision.delta_a
             expected = controller.expect(decision.pieces, self._figures.pulled(moved))
         surprise = felt(controller.kinematic.hand, expected, seen, after)
-        if surprise is not None:
+        if surprise is not None and not surprise.wrong(seen):  # else a finger slid, or a link took its load
             self._learn_forces(expected, surprise)
         return self.learn_increment(expected, moved, after.state.minus(seen.state))
 
