@@ -19,6 +19,16 @@ import copyreg
 from collections.abc import Iterable
 from typing import Any
 
+__all__ = [
+    "BusError", "CalibrationError", "CommandRefusedError", "DescriptionError", "DeviceError", "EKMError",
+    "EquilibriumError", "FileFormatError", "FolderInUseError", "GraspEndsError", "GraspError",
+    "JointMismatchError", "MissingExtraError", "NeverAtRestError", "NoContactError", "NoDerivativeError",
+    "NoStateError", "NonFiniteError", "ObjectLostError", "OutputError", "ParameterError",
+    "PenetrationError", "PlacedError", "PlantInUseError", "ResumeError", "ShapeError", "SingularGraspError",
+    "SolverError", "SpeedWarning", "StaleReadingError", "StateError", "StateMismatchError",
+    "UnknownNameError", "UnstableGraspError", "WorkerDiedError",
+]  # fmt: skip
+
 _LONGEST = 2000  # characters of a message
 _LONGEST_VALUE = 300  # of a value in one
 
