@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -305,25 +306,24 @@ class SimulatedHand:
             self._rig.change(parameters)
 
     def _planned(self, request: PinchRequest) -> PinchPlan:
-        """The pinch that is wanted, or a gentler one where its force makes the grasp soft.
-
-        Raises:
-            EquilibriumError: as of :func:`remembered_pinch`.
-        """
+        """The pinch that is wanted, or a gentler one where its force makes the grasp soft."""
         plan = remembered_pinch(self._problem, request)
         if self.config.pinch_force is None and request.force > _GENTLE and self._softened(plan):
             with contextlib.suppress(EquilibriumError):
                 return remembered_pinch(self._problem, dataclasses.replace(request, force=_GENTLE))
         return plan
 
+    @functools.cached_property
+    def _model(self) -> KinematicModel:  # as described
+        return KinematicModel(self.hand, self.object, ModelOptions(on_unstable="flag"))
+
     def _softened(self, plan: PinchPlan) -> bool:
         """Its forces have made the grasp soft, as far as the model knows it."""
-        model = KinematicModel(self.hand, self.object, ModelOptions(on_unstable="flag"))
         named = dict(zip(plan.pads, -np.einsum("ci,ci->c", plan.forces, plan.normals), strict=True))
         (force,) = _tensors(np.array([named.get(pad.name, 0.0) for pad in self.hand.pads]))
         try:
             state = GraspState(*_tensors(plan.q, plan.position, plan.rotation))
-            return softened(model, model.linearize(state, fingertip_force=force))
+            return softened(self._model, self._model.linearize(state, fingertip_force=force))
         except GraspError:
             return False
 
