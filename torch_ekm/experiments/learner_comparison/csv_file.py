@@ -22,11 +22,11 @@ from ...typing import Array
 Names = tuple[str, ...]
 #: Values ``(n_rows, n)`` of the n columns that it is given.
 Read = Callable[[Sequence[str]], Array]
-Records = Callable[[], Iterator[tuple[int, list[str]]]]
+Records = partial[Iterator[tuple[int, list[str]]]]
 
 _LARGEST = 128 << 20  # bytes: a figure of one digit takes four times as much in memory
 _LONGEST = 1 << 20  # characters of one record, which is a line where no quoted text has line breaks
-_SEPARATORS = ",;\t"
+_SEPARATORS = ",;\t "
 _EXCEL = re.compile(r'"?sep=([,;\t|:^~])"?', re.IGNORECASE)
 _TRIED = 6  # records that tell which separator it is
 
@@ -34,11 +34,11 @@ _TRIED = 6  # records that tell which separator it is
 def open_csv(path: Path, label: str) -> tuple[Names, Read]:
     """Column names, and a function that reads some of them.
 
-    UTF-8, of at most 128 MiB. Separated by comma, semicolon or tab: by the one that gives the first lines as
-    many fields as the header, texts in quotes apart; or as a first line ``sep=;`` says. Lines before the
-    header may be comments, ``# ...``. The header names the columns. Every other field that is read is a
-    number with a decimal point. Blanks around fields, empty lines, and a separator at the end of a line do
-    not count.
+    UTF-8, of at most 128 MiB. Separated by comma, semicolon, tab or blanks: by the one that gives the first
+    lines as many fields as the header, texts in quotes apart; or as a first line ``sep=;`` says. The header
+    names the columns. Lines before it may be comments, ``# ...``; the last of them is the header where only
+    numbers follow, as of ``numpy.savetxt``. Every other field that is read is a number with a decimal point.
+    Blanks around fields, empty lines, and a separator at the end of a line do not count.
 
     Raises:
         DescriptionError: the file cannot be used; the message names line and column. The function raises
@@ -51,10 +51,13 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
     number, names = next(records(), (0, []))
     if not names:
         raise DescriptionError(path, "the file is empty")
-    names = _trimmed(names, len(names) - 1)
+    names = _trimmed(names, n := len(names) - 1)
     if all(figure(field) is not None for field in names):
-        problem = "holds numbers only; the first line that does not begin with # must name the columns"
-        raise DescriptionError(path, f"line {number} {problem}")
+        records = partial(_records, path, text, before - 1, records.args[-1])
+        names = _trimmed(next(records())[1], n) if before else []
+        if len(names) <= n or all(figure(field) is not None for field in names):
+            problem = "holds numbers only; it, or a comment right before it, must name the columns"
+            raise DescriptionError(path, f"line {number} {problem}")
     return tuple(names), partial(_read, path, tuple(names), records, label)
 
 
@@ -65,7 +68,8 @@ def _fit(records: Records) -> tuple[bool, int]:
     except DescriptionError:
         return False, 1
     names = _trimmed(first[0], len(first[0]) - 1) if first else []
-    return all(len(_trimmed(row, len(names))) == len(names) > 1 for row in first), len(names)
+    fits = all(len(_trimmed(row, len(names))) == len(names) > 1 for row in first)
+    return fits, 1 if records.args[-1] == " " and not fits else len(names)  # names may hold blanks
 
 
 def _preamble(text: str) -> tuple[int, str]:
@@ -81,7 +85,7 @@ def _preamble(text: str) -> tuple[int, str]:
 
 
 def _records(path: Path, text: str, before: int, separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Records that are not blank, with the number of their last line."""
+    """Records that are not blank, with the number of their last line; the first may be a comment."""
     length = 0
 
     def lines() -> Iterator[str]:
@@ -91,7 +95,7 @@ def _records(path: Path, text: str, before: int, separator: str) -> Iterator[tup
             if length > _LONGEST:
                 problem = f"has more than {_LONGEST} characters, or stands in a quote that does not close"
                 raise DescriptionError(path, f"line {before + reader.line_num + 1} {problem}")
-            yield line
+            yield line.lstrip(" " if reader.line_num else "# ")
 
     reader = csv.reader(lines(), delimiter=separator, skipinitialspace=True)
     try:
