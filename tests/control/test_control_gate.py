@@ -209,13 +209,15 @@ def error_of_a_clean_turn(held, ekm: EnhancedModel, knowledge: HandKnowledge) ->
     return float(torch.stack(off).square().mean().sqrt()) / DEG
 
 
-@pytest.mark.parametrize("lie", LIES)
-def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str) -> None:
+@pytest.mark.parametrize(
+    ("lie", "whole"), [*((lie, False) for lie in LIES), ("motors reversed, encoders too", True)]
+)
+def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str, whole: bool) -> None:
     kind, fault, reason, what, remedy = LIES[lie]
     ekm, knowledge, before = copy.deepcopy(taught)
     plant = kind(held[2], held[0], fault, since=0, dead_zone=1.3 * DEG)
     controller = LookAndMoveController(ekm, held[1])
-    loop = ClosedLoop(plant, controller, knowledge=knowledge, planner=OneStep())
+    loop = ClosedLoop(plant, controller, knowledge=knowledge, planner=None if whole else OneStep())
     known = knowledge.servo.estimate.clone()
     done = loop.run(PoseTarget.turned(held[0].state, held[1], degrees=20))
     assert done.reason is (reason or done.reason)

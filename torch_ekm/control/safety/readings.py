@@ -118,14 +118,17 @@ class ReadingTests:
         i = int(away.argmax())
         jump = f"encoder '{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
         jump += f"({deg(most)} more are allowed, Guards.encoder_jump): check its cable and zero"
-        said += against(away[i] > most, StopReason.ENCODER_JUMP, jump)
-        if abs(v).max() >= guards.unchanged:
-            share, i = float(moved @ v) / float(v @ v), int((moved * v).argmin())
-            back = f"encoders made {share:.1f} of the motion that was commanded (limit -{AGAINST:g}): "
-            back += f"'{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were"
-            back += f": a sign of the motors or of their encoders is wrong; {CHECK_PLANT}"
-            said += against(-share > AGAINST, StopReason.WRONG_WAY, back)
-        return said
+        jumped = against(away[i] > most, StopReason.ENCODER_JUMP, jump)
+        if abs(v).max() < guards.unchanged:
+            return said + jumped
+        share, i = float(moved @ v) / float(v @ v), int((moved * v).argmin())
+        back = f"encoders made {share:.1f} of the motion that was commanded (limit -{AGAINST:g}): "
+        back += f"'{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were"
+        back += f": a sign of the motors or of their encoders is wrong; {CHECK_PLANT}"
+        wrong_way = against(-share > AGAINST, StopReason.WRONG_WAY, back)
+        sent_off = abs(v) >= guards.unchanged  # all of these went back: no single encoder that jumps
+        mirrored = ((moved * v)[sent_off] < 0).all() and (abs(moved) - abs(v)).max() <= guards.unchanged
+        return said + (wrong_way + jumped if mirrored else jumped + wrong_way)
 
     def _speed(self, before: Observation, seen: Observation) -> list[Objection]:
         if not (seen.dated and before.dated):
