@@ -18,7 +18,7 @@ from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import DescriptionError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
-from ..kinematics.link_poses import Kinematics
+from ..kinematics.hand_kinematics import Kinematics
 from ..typing import Array, Float, Tensor
 from .contact_set import LINK_MARGIN, ContactSet, NearMiss
 from .link_contact import LinkShapes

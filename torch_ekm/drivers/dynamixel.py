@@ -9,10 +9,9 @@ from typing import Any
 
 from ..description import HandDescription
 from ..exceptions import BusError
-from .bus_reading import BusReading
 from .driver import HandDriver
-from .dynamixel_port import DynamixelPort
-from .servos import SERVOS, Servo
+from .dynamixel_port import SERVOS, DynamixelPort, Servo
+from .gathered import BusReading
 
 _TURN = 4096
 _TICKS = _TURN / (2 * math.pi)  # per rad

@@ -14,9 +14,8 @@ import torch
 from .._extras import require
 from ..description import HandDescription
 from ..exceptions import BusError
-from .bus_reading import BusReading
 from .driver import HandDriver
-from .gathered import Gathered, Value
+from .gathered import BusReading, Gathered, Value
 from .one_master import OneMaster
 from .pose import Sighting
 from .wiring import Channel

@@ -16,8 +16,7 @@ from ..contact.detector import ContactDetector
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import A_STATE, GraspState
-from ..kinematics.hand_kinematics import HandKinematics
-from ..kinematics.link_poses import Kinematics, LinkPoses
+from ..kinematics.hand_kinematics import HandKinematics, Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
 from .arms import Arms, arms_at, bends, over_posture
 from .checks import at_pads, check_contacts, check_described, check_inertia, check_state

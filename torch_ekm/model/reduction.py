@@ -11,7 +11,7 @@ from .._arrays import like, namespace, norm
 from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
-from ..kinematics.null_space import null_space
+from ..kinematics.tensors import null_space
 from ..typing import AnyArray, Bool, Float, Tensor
 from .arms import SAME, Arms
 from .manipulation import KKTSolution, two_stage

@@ -12,9 +12,7 @@ from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .gate import Gate
 from .observation import Observation
-from .path import Path
-from .plant import Plant
-from .wrapper import PlantWrapper
+from .plant import Path, Plant, PlantWrapper
 
 
 class ServoInverse(PlantWrapper):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..._noise import NOISE
 from ...exceptions import GraspError
-from ...kinematics.play import Play
+from ...kinematics.servo_model import Play
 from ...typing import Array, Tensor
 from ..kinematic_model import KinematicModel
 from ..linearization import Linearization

@@ -13,7 +13,7 @@ from ...contact.contact_model import ContactModel
 from ...contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet, Detector
 from ...description.hand import HandDescription
 from ...kinematics.grasp_state import GraspState
-from ...kinematics.link_poses import Kinematics, LinkPoses
+from ...kinematics.hand_kinematics import Kinematics, LinkPoses
 from ...kinematics.se3 import hat
 from ...typing import AnyArray, Array, Tensor
 from ..arms import arms_at, bends

@@ -15,7 +15,7 @@ from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import EquilibriumError, ParameterError
 from ...kinematics import HandKinematics
-from ...kinematics.null_space import null_space
+from ...kinematics.tensors import null_space
 from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import chain, make_transmission, true_object
