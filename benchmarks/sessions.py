@@ -100,19 +100,6 @@ def _readings(done: Manipulation) -> dict[str, float]:
     }
 
 
-def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence[float]) -> list[TrialRecord]:
-    """Thirty motions with the first object; turns of the others, which the hand has never held."""
-    records, knowledge = [], None
-    for k, item in enumerate(items):
-        bench = make(item)
-        bench.knowledge = knowledge = bench.knowledge if knowledge is None else knowledge
-        records += (
-            [bench.trial(seed, j, angle) for j, angle in enumerate(angles)] if k else bench.learn_hand(seed)
-        )
-        bench.close()
-    return records
-
-
 def _warmed(make: Make, item: str, seed: int, angles: Sequence[float]) -> Bench:
     bench = make(item)
     for k, angle in enumerate(angles if bench.learns else ()):

@@ -22,7 +22,7 @@ from experiments_records import frame
 from hands import CONDITIONS, FAMILIES, OTHERS, STRENGTHS, hands
 from matrix import FIGURES, bands_table, pivot, verdict
 from questions import QUESTIONS
-from sessions import TARGETS, Part, new_objects, target_of
+from sessions import TARGETS, Part, target_of
 
 from torch_ekm.control.safety.on_the_way import OnTheWay
 from torch_ekm.experiments import runner

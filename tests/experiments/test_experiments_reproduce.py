@@ -72,7 +72,7 @@ def test_report_is_complete(name: str, reports: Callable[[str], tuple[Report, Pa
     assert configuration["versions"]["torch"]
     assert configuration["plant"]["dead_zone"] > 0
     assert "Development seeds" in report.summary
-    assert "no verdict" in report.summary
+    assert "not tested" in report.summary
 
 
 def test_a_hand_that_cannot_be_modelled_gives_the_reason_alone_and_ends_with_1(

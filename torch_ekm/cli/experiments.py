@@ -29,10 +29,11 @@ def demo(
     jobs: Jobs = 2,
     quick: Annotated[bool, Option(help="Two seeds, two angles: a trial run.")] = False,
 ) -> None:
-    """Turn an object with the KM and with the E-KM, and report.
+    """Turn an object with the KM and with the E-KM, then objects that are new to the hand, and report.
 
-    Eight instances of the simulated hand, five turns from new grasps with each controller: two to three
-    minutes on two cores; half a minute with --quick. Interrupted, it continues where it stopped.
+    Eight instances of the simulated hand, five turns from new grasps with each controller; then four more
+    objects with the first of them: three to four minutes on two cores; half a minute with --quick.
+    Interrupted, it continues where it stopped.
     """
     from ..experiments.config import Setting
     from ..experiments.protocols.demo import Demo
@@ -159,9 +160,9 @@ def compare(
 
 def _left_out(planned: Experiment) -> str:
     """What of the whole experiment is not run."""
-    objects = getattr(planned.protocol, "objects", ())
-    every = getattr(type(planned.protocol)(), "objects", ())
-    missing = [name for name in every if name not in objects]
+    whole, which = type(planned.protocol)(), "new" if hasattr(planned.protocol, "new") else "objects"
+    taken = getattr(planned.protocol, which, ())
+    missing = [name for name in getattr(whole, which, ()) if name not in taken]
     seeds = ", ".join(map(str, planned.seeds))
     return f"Seeds {seeds}; left out: {', '.join([*missing, 'other seeds', 'larger turns'])}."
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -202,6 +202,27 @@ class Bench:
         self.enhanced = EnhancedModel.for_grasp(
             self.model, start, self.learner, self.encoding, self.knowledge.figures
         )
+
+
+def new_objects(
+    make: Callable[[str], Bench],
+    items: Sequence[str],
+    seed: int,
+    *,
+    angles: Sequence[float],
+    kind: str = "turn",
+) -> list[TrialRecord]:
+    """The hand is learned with the first object; then turns of the others, which it has never held."""
+    records, knowledge = [], None
+    for k, item in enumerate(items):
+        bench = make(item)
+        bench.knowledge = knowledge = bench.knowledge if knowledge is None else knowledge
+        if k:
+            records += [bench.trial(seed, j, angle, kind) for j, angle in enumerate(angles)]
+        elif bench.learns:
+            records += bench.learn_hand(seed)
+        bench.close()
+    return records
 
 
 def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting) -> Plant:

@@ -145,7 +145,7 @@ class Generalize(Protocol):
             summary += (
                 f" Turns of the E-KM with each object and seed before those that count: {self.warm_up}."
             )
-        if significance.rows:
+        if significance.rows and len(self.objects) > 1:
             won, *_, until = (row[-1] for row in significance.rows)
             summary += f" Cells that the E-KM wins on one hand: {won}; significant after {until} turns."
         leading, legend = int(shown[0].name == "paper"), tables.legend(trials)
