@@ -114,8 +114,8 @@ def _show(shown: View, page: Path) -> None:
     from ..rendering import save_animation
 
     if shown.rows:
-        print_table(shown.header, shown.rows, shown.told.title)
+        print_table(shown.header, shown.rows, shown.captions.title)
     for note in shown.notes:
         say(f"Not drawn: {note}")
-    say(f"Page:      {save_animation(shown.scene, page, shown.told).resolve()}")
+    say(f"Page:      {save_animation(shown.scene, page, shown.captions).resolve()}")
     say_next("open the page in a browser: play, step, drag to look around")

@@ -232,7 +232,7 @@ def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting) -
     hand, stuck = simulated.hand, setting.parameters.stuck_joints
     hall = HallSensors(hand) if hand.hall_sensors else None
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall)
-    if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
+    if hall is not None:  # after the calibration: a channel that was dead by then would be invalid
         hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
     rested = FramesAtRest(sensed, setting.frames)
     return rested if hall is None else ContactAligned(rested, hand, simulated.object)

@@ -13,7 +13,7 @@ import numpy as np
 from ...control import StopReason
 from ...description import load_hand, load_object
 from ...exceptions import EKMError
-from ...rendering import Told, make_scene, save_animation, save_picture
+from ...rendering import Captions, make_scene, save_animation, save_picture
 from ..config import digest
 from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
@@ -113,10 +113,10 @@ class Demo(Generalize):
         what = f"{turn.angle_deg:g} deg (seed {turn.seed}) by the E-KM"
         left = np.array(turn.errors_deg)
         lines = tuple(f"motion {k}: {error:.2f} deg to go" for k, error in enumerate(left))
-        told = Told(
+        captions = Captions(
             f"{hand.name} turns {obj.name}: E-KM", lines, turn.angle_deg - left, target=turn.angle_deg
         )
-        save_animation(scene, folder / "animation.html", told, seconds=0.5)
+        save_animation(scene, folder / "animation.html", captions, seconds=0.5)
         moving = FigureFile("animation.html", f"A turn of {what}, motion by motion: drag to look around.")
         try:
             save_picture(scene, folder / "hand.png", frames=(0, -1))
