@@ -72,7 +72,7 @@ notebooks: install
 
 notebooks-smoke: install
 	$(BIN)/python tests/notebooks/smoke.py build/notebooks
-	TORCH_EKM_SMOKE=1 $(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 build/notebooks
+	$(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 build/notebooks
 
 lint: install
 	$(BIN)/ruff check .

@@ -76,12 +76,17 @@ def say_note(text: object) -> None:
 
 
 @contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
+def progress(what: str, total: int, seconds: float = 0.0) -> Iterator[Callable[[object], None]]:
     """What, a bar, how many of how many, for how long, how long still; gives what is called after each.
 
     Ctrl-C ends it; what is finished is kept by who runs it.
+
+    Args:
+        seconds: what all take on free cores: an estimate, until the first has ended; 0: unknown.
     """
-    say("Ctrl-C stops; the same command then goes on from there.")
+    minutes = max(round(seconds / 60), 1)
+    about = f"{total} to do, some {minutes} min on free cores, less what is finished. " if seconds else ""
+    say(f"{about}Ctrl-C stops; the same command then goes on from there.")
     name = TextColumn("{task.description}", markup=False)
     left = TextColumn("left:"), TimeRemainingColumn()
     columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), *left)

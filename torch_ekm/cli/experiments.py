@@ -16,8 +16,8 @@ from typer import Argument, Option  # isort: skip
 if TYPE_CHECKING:
     from ..experiments.reproduce import Experiment
 
-#: Seconds of a session on one free core, else 20: how long it takes is said before the first has ended.
-_SESSION = {"online": 70}
+#: Seconds of a session on one free core, else 20; of a learner on 1500 rows.
+_SESSION, _LEARNER = {"online": 70}, 10
 
 
 @app.command()
@@ -137,7 +137,8 @@ def compare(
     if jobs > 1 and find_spec("joblib") is None:
         say("One process at a time: joblib, of the extra 'experiments', is not installed.")
         jobs = 1
-    with progress("comparing", len(data) * len(chosen)) as advance:
+    n = len(data) * len(chosen)
+    with progress("comparing", n, n * _LEARNER * limit / 1500 / jobs) as advance:
         compared = run(
             data,
             chosen,
@@ -172,9 +173,8 @@ def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> None:
 
     if planned.quick:
         say(f"A trial run, which claims nothing. {_left_out(planned)}")
-    n, minutes = len(planned.jobs), len(planned.jobs) * _SESSION.get(what, 20) / jobs / 60
-    say(f"{n} sessions, {jobs} at once: some {max(1, round(minutes))} min, less what is finished.")
-    with progress(what, len(planned.jobs)) as advance:
+    n = len(planned.jobs)
+    with progress(what, n, n * _SESSION.get(what, 20) / jobs) as advance:
         report = run(planned, folder, jobs, advance)
     print_report(report, folder)
     if report.empty:
