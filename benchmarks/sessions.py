@@ -249,10 +249,8 @@ def foresight(
 ) -> list[TrialRecord]:
     """Turns without the camera, by touch and by prediction; then as far as the grasp goes, predicted."""
     bench, made = _warmed(make, items[0], seed, learns_by), []
-    dark = {"learn": False, "blind_deg": math.inf}
-    ways = (
-        {"blind, by touch": {**dark, "touch": True}, "blind, prediction alone": dark} if bench.learns else {}
-    )
+    dark = {"blind, by touch": True, "blind, prediction alone": False}
+    ways = {part: {"learn": False, "touch": touch} for part, touch in dark.items() if bench.learns}
     for part, options in {**ways, "as far as it goes": {}}.items():
         start = bench.grasp(seed, _BLIND if options else _FAR)
         about = Trial(bench.name, "turn", bench.controller, seed, _FAR, blind if options else far)

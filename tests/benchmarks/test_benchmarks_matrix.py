@@ -185,7 +185,7 @@ def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.Monkey
             return super().trial(*what, **options)
 
     setting = Setting(hand="planar_two_finger", engine="mujoco").hardware_instance(3)
-    made = new_objects(lambda item: Noted(setting, item, "E-KM"), ["box", "can"], 3, angles=(4.0,))
+    made = runner.new_objects(lambda item: Noted(setting, item, "E-KM"), ["box", "can"], 3, angles=(4.0,))
     assert (made[-1].object, made[-1].kind) == ("can", "turn")
     assert {(one.object, one.kind) for one in made[:-1]} == {("box", "first")}
     (_, none, _), *_, (item, known, learner) = grasps

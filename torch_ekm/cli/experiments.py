@@ -16,8 +16,8 @@ from typer import Argument, Option  # isort: skip
 if TYPE_CHECKING:
     from ..experiments.reproduce import Experiment
 
-#: Seconds of a session on one free core, else 20; of a learner on 1500 rows.
-_SESSION, _LEARNER = {"online": 70}, 10
+#: Seconds on one free core: of a session, else 20; of a quick one; of a learner on 1500 rows.
+_SESSION, _QUICK, _LEARNER = {"online": 70}, 8, 10
 
 
 @app.command()
@@ -173,8 +173,8 @@ def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> None:
 
     if planned.quick:
         say(f"A trial run, which claims nothing. {_left_out(planned)}")
-    n = len(planned.jobs)
-    with progress(what, n, n * _SESSION.get(what, 20) / jobs) as advance:
+    n, each = len(planned.jobs), _QUICK if planned.quick else _SESSION.get(what, 20)
+    with progress(what, n, n * each / jobs) as advance:
         report = run(planned, folder, jobs, advance)
     print_report(report, folder)
     if report.empty:

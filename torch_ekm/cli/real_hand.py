@@ -138,6 +138,7 @@ def health(
         raise typer.Exit(1)
     few = "" if sum(motions) > BASELINE else f" An actuator is judged after {BASELINE} motions."
     say(f"No actuator changed in {sum(motions)} motions.{few}")
+    say_next("torch-ekm knowledge FILE shows what a closed loop has learned of the hand")
 
 
 @app.command()

@@ -132,9 +132,8 @@ class Bench:
         *,
         learn: bool = True,
         events: Sequence[Tug | PlantChange] = (),
-        blind_deg: float = 0.0,
+        touch: bool | None = None,
         poses: bool = False,
-        **blind: Any,
     ) -> TrialRecord:
         """Turn the object that is held.
 
@@ -142,24 +141,16 @@ class Bench:
             start: from where, as measured.
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
-            blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
+            touch: without a camera, with touch or by prediction alone; None: with the camera.
             poses: keep the true poses, for pictures.
-            blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
         now = self.disturbed.count
         self.disturbed.events = tuple(dataclasses.replace(event, at=event.at + now) for event in events)
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
         plant = self.plant
-        if blind_deg:
-            plant = BlindPose(
-                plant,
-                self._predictor,
-                axis,
-                # rotation off the axis does not keep the camera on: a model that tilts is not to be helped
-                switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
-                **{"touch": False, **blind},
-            )
+        if touch is not None:
+            plant = BlindPose(plant, self._predictor, axis, touch=touch)
         self.last = self.closed_loop(plant, learn=learn).run(target)
         if (
             self.last.stop.cause is not None
