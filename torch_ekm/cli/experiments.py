@@ -16,8 +16,8 @@ from typer import Argument, Option  # isort: skip
 if TYPE_CHECKING:
     from ..experiments.reproduce import Experiment
 
-#: Seconds of a session on one free core, else 20: how long it takes is said before the first has ended.
-_SESSION = {"online": 70}
+#: Seconds on one free core: of a session, else 20; of a quick one; of a learner on 1500 rows.
+_SESSION, _QUICK, _LEARNER = {"online": 70}, 8, 10
 
 
 @app.command()
@@ -29,10 +29,11 @@ def demo(
     jobs: Jobs = 2,
     quick: Annotated[bool, Option(help="Two seeds, two angles: a trial run.")] = False,
 ) -> None:
-    """Turn an object with the KM and with the E-KM, and report.
+    """Turn an object with the KM and with the E-KM, then objects that are new to the hand, and report.
 
-    Eight instances of the simulated hand, five turns from new grasps with each controller: two to three
-    minutes on two cores; half a minute with --quick. Interrupted, it continues where it stopped.
+    Eight instances of the simulated hand, five turns from new grasps with each controller; then four more
+    objects with the first of them: three to four minutes on two cores; half a minute with --quick.
+    Interrupted, it continues where it stopped.
     """
     from ..experiments.config import Setting
     from ..experiments.protocols.demo import Demo
@@ -136,7 +137,8 @@ def compare(
     if jobs > 1 and find_spec("joblib") is None:
         say("One process at a time: joblib, of the extra 'experiments', is not installed.")
         jobs = 1
-    with progress("comparing", len(data) * len(chosen)) as advance:
+    n = len(data) * len(chosen)
+    with progress("comparing", n, n * _LEARNER * limit / 1500 / jobs) as advance:
         compared = run(
             data,
             chosen,
@@ -159,9 +161,9 @@ def compare(
 
 def _left_out(planned: Experiment) -> str:
     """What of the whole experiment is not run."""
-    objects = getattr(planned.protocol, "objects", ())
-    every = getattr(type(planned.protocol)(), "objects", ())
-    missing = [name for name in every if name not in objects]
+    whole, which = type(planned.protocol)(), "new" if hasattr(planned.protocol, "new") else "objects"
+    taken = getattr(planned.protocol, which, ())
+    missing = [name for name in getattr(whole, which, ()) if name not in taken]
     seeds = ", ".join(map(str, planned.seeds))
     return f"Seeds {seeds}; left out: {', '.join([*missing, 'other seeds', 'larger turns'])}."
 
@@ -171,9 +173,8 @@ def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> None:
 
     if planned.quick:
         say(f"A trial run, which claims nothing. {_left_out(planned)}")
-    n, minutes = len(planned.jobs), len(planned.jobs) * _SESSION.get(what, 20) / jobs / 60
-    say(f"{n} sessions, {jobs} at once: some {max(1, round(minutes))} min, less what is finished.")
-    with progress(what, len(planned.jobs)) as advance:
+    n, each = len(planned.jobs), _QUICK if planned.quick else _SESSION.get(what, 20)
+    with progress(what, n, n * each / jobs) as advance:
         report = run(planned, folder, jobs, advance)
     print_report(report, folder)
     if report.empty:

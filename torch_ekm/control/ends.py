@@ -89,7 +89,7 @@ class Ends:
     limited = False
     """The last movement was cut short by an actuator's limit."""
     surprise = ""
-    """The first reading that was believed though no motion explains it, or the one with the largest leap."""
+    """The first reading that was accepted though no motion explains it, or the one with the largest leap."""
 
     def __init__(
         self, rule: StoppingRule, target: PoseTarget, controller: LookAndMoveController, seen: Observation

@@ -165,7 +165,7 @@ class DynamixelPlant(HandDriver):
         return mode, current_ma
 
     def _within_limits(self) -> None:
-        """In mode 3 a servo takes no goal beyond its limits, and says nothing."""
+        """In mode 3 a servo takes no goal beyond its limits, without an error."""
         for one, found in zip(self.wiring.motors, self._found, strict=True):
             low, high = found["Min Position Limit"], found["Max Position Limit"]
             least, most = sorted(round(one.bus(x)) for x in (one.lower, one.upper))

@@ -45,7 +45,7 @@ class Value(NamedTuple):
 class SenderClock:
     """How far a sender's clock is off ours: by the least that a message was ever late, less their drift.
 
-    What all messages have in common, their latency or the clocks' difference, cannot be told apart: up to
+    What all messages have in common, their latency or the clocks' difference, cannot be distinguished: up to
     0.5 s it counts as latency, more and what is negative as difference.
     """
 

@@ -12,6 +12,7 @@ import json
 import os
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -139,7 +140,8 @@ def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> O
 def _watching(parent: int) -> Callable[[], None]:
     """Ends a process when its parent has: killed, a parent gives no notice.
 
-    A local function goes to the process by value, which so imports what its jobs need and no more.
+    A local function goes to the process by value, which so imports what its jobs need and no more. What is
+    compiled in the background is no news of a job.
     """
 
     def watch() -> None:
@@ -148,6 +150,7 @@ def _watching(parent: int) -> Callable[[], None]:
         os._exit(1)
 
     def begin() -> None:
+        warnings.filterwarnings("ignore", "a process in the background compiles loops")
         if os.name != "nt":  # there a process keeps the number of a parent that is gone
             threading.Thread(target=watch, daemon=True).start()
 

@@ -64,9 +64,9 @@ class BlindPose(PlantWrapper):
         self.dark, self.looks = False, 0
         """The camera is off; how often it was asked since."""
         self._tests = ReadingTests(Guards(), self.filter.kinematic.hand)
-        self._sent: Tensor | None = None  # of a motion from which no reading was believed yet
+        self._sent: Tensor | None = None  # of a motion from which no reading was accepted yet
         self._before: Observation | None = None
-        """As measured, the last reading that was believed."""
+        """As measured, the last reading that was accepted."""
 
     @property
     def axis_std(self) -> float:
@@ -88,20 +88,20 @@ class BlindPose(PlantWrapper):
         """``seen``, with the estimated state while the camera is off; a reading that :class:`Guards` refuse
         changes nothing of the estimate."""
         before, guards = self._before, self._tests.guards
-        believed = not self._tests.motors(before, self._sent, seen)
+        accepted = not self._tests.motors(before, self._sent, seen)
         if not self.dark:
             self._before, self._sent = seen, None
             self.dark = self._switch_off is None or self._switch_off(seen)
             if self.dark:
                 self.filter.start(seen.state, seen.fingertip_force, _covariance(seen))
             return seen
-        if believed:
+        if accepted:
             if self._sent is not None and before is not None:
                 self.filter.move(seen.a - before.a, before.fingertip_force)
             self._before, self._sent = seen, None
             if float((seen.q - self.filter.state.q).abs().max()) <= guards.joint_jump:
                 self.filter.measure(seen.q, seen.fingertip_force)
-        looked = believed and self.axis_std > self.look_again and seen.status is PlantStatus.HELD
+        looked = accepted and self.axis_std > self.look_again and seen.status is PlantStatus.HELD
         if looked:
             self.looks += 1
             self.filter.look(seen.state, _covariance(seen))

@@ -26,7 +26,7 @@ from .reduction import Reduction
 
 Mask = NDArray[np.bool_]
 STOP_TOLERANCE = math.radians(0.1)
-"""How near to a limit a joint counts as touching its stop [rad]. Joint angles alone cannot tell how much
+"""How near to a limit a joint counts as touching its stop [rad]. Joint angles alone do not determine how much
 torque a stop takes from the contact forces; fingertip sensors can."""
 _STOP_TORQUE = 0.01  # [N m] above which a stop holds its joint; below, the joint may leave
 

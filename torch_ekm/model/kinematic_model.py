@@ -278,7 +278,7 @@ class KinematicModel(nn.Module):
         previous: Linearization | None = None,
         on_unstable: str | None = None,
     ) -> Linearization:
-        """Contacts, forces, ``J_m``, the force sensitivities and what speaks against them, at a state.
+        """Contacts, forces, ``J_m``, the force sensitivities and their doubts, at a state.
 
         Differentiable: with respect to the state, and to the buffers ``spring_stiffness``, ``spring_rest``,
         ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks

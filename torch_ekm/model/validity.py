@@ -1,4 +1,4 @@
-"""What speaks against a linearization: findings with figure, limit and remedy, worst first."""
+"""Why a linearization may be wrong: findings with figure, limit and remedy, worst first."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether a reading may move the hand or teach: what :class:`Guards` say of each motion of a closed loop."""
+"""Whether a reading is plausible: the tests of :class:`Guards` in each motion of a closed loop."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Look = Callable[[], Observation]
 
 
 class Verdict(NamedTuple):
-    """What is believed after a motion."""
+    """The reading that is used after a motion."""
 
     seen: Observation
     """The reading to go on with; of a blind motion with the pose that the model predicted."""
     teaches: bool
-    """Both ends of the motion were measured, and nothing speaks against them."""
+    """Both ends of the motion were measured, and no test fails."""
     halt: Objection | None = None
     """Why the manipulation must end here."""
     note: str = ""
@@ -60,7 +60,7 @@ class Watch:
     slid = ""
     """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
     lie = ""
-    """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
+    """A sensor that contradicts the others, so that nothing is learned; or empty."""
     doubt = ""
     """A fingertip at fault, or on a hand of which nothing is known all of them; or empty."""
 

@@ -28,7 +28,7 @@ _LARGEST = 128 << 20  # bytes: a figure of one digit takes four times as much in
 _LONGEST = 1 << 20  # characters of one record, which is a line where no quoted text has line breaks
 _SEPARATORS = ",;\t "
 _EXCEL = re.compile(r'"?sep=([,;\t|:^~])"?', re.IGNORECASE)
-_TRIED = 6  # records that tell which separator it is
+_TRIED = 6  # records that decide on the separator
 
 
 def open_csv(path: Path, label: str) -> tuple[Names, Read]:
@@ -77,10 +77,10 @@ def _preamble(text: str) -> tuple[int, str]:
     separator = ""
     for number, line in enumerate(io.StringIO(text, newline="")):
         line = line.strip("\r\n")
-        told = _EXCEL.fullmatch(line)
-        if told is None and line.strip() and not line.startswith("#"):
+        stated = _EXCEL.fullmatch(line)
+        if stated is None and line.strip() and not line.startswith("#"):
             return number, separator
-        separator = told[1] if told else separator
+        separator = stated[1] if stated else separator
     return 0, separator
 
 

@@ -132,7 +132,7 @@ class _Problem:
         """Standard deviation of each kind of residual; those of motions by the median, since contacts slip.
 
         Rows that no parameter moves (out of a planar hand's plane) say nothing. The parameters take their
-        share of the freedom, as far as the data and not the priors tell them.
+        share of the freedom, as far as the data and not the priors determine them.
         """
         at, sensors = self.at(x), self.evidence.sensors
         moved = np.abs(at.jacobian).max(axis=1) > 1e-9

@@ -31,7 +31,7 @@ _STEPS = 60  # of a descent
 _FIRST = ("force", "width")  # their decrease is tried whatever the slope says
 _LIKELY = ("range", "all springs")  # so is what lowers the cost of these
 _CENTRED = "fingertips centred on the object (spread = 0), as it is otherwise"
-_TOLD = 3  # changes that are told
+_SHOWN = 3  # changes that are shown
 
 
 @dataclass(frozen=True)
@@ -114,10 +114,10 @@ def smallest_changes(
             break
         if (found := _with(case, change, starts)) is not None:
             held.append((abs(found[0]), n, change, found[1]))
-    told: dict[str, str] = {}
+    shown: dict[str, str] = {}
     least: list[tuple[float, str]] = []
     for size, _, change, x in sorted(held, key=lambda one: one[:2]):
-        if change.kind in told or len(told) == _TOLD:
+        if change.kind in shown or len(shown) == _SHOWN:
             continue
         low, high = 0.0, size
         for _ in range(_FINER):
@@ -125,8 +125,8 @@ def smallest_changes(
             found = None if time.process_time() > end else _held(change.of(change.side * middle), x)
             low, high, x = (middle, high, x) if found is None else (low, middle, found)
         far = " (as far as geometry goes)" if case.borne else ""
-        told[change.kind] = change.text(change.side * high) + far
-        least.append((high, told[change.kind]))
+        shown[change.kind] = change.text(change.side * high) + far
+        least.append((high, shown[change.kind]))
     return Cure([text for _, text in sorted(least)], q)
 
 
