@@ -370,7 +370,7 @@ class ContactMotion:
         model, detector = self.model, self.model.detector
         poses = model.kinematics(state.q)
         if isinstance(detector, ContactDetector):
-            contacts = detector.near(poses, state.position, state.rotation, NEAR)
+            contacts = detector.near(poses, state.position, state.rotation, NEAR, self.loads.force)
         else:
             contacts = detector(state.q, state.position, state.rotation)
         return PlacedGrasp(model, state, contacts, poses, self._springs)

@@ -85,7 +85,7 @@ class PlacedGrasp:
         self._model = model
         kin, S = self.kin, model.reduction.scaled_basis.numpy()
         A = np.concatenate([full_hand_jacobian(kin), -full_grasp_matrix(kin).mT], axis=-1) @ S
-        A = A.reshape(contacts.n_c, 6, -1) / _LENGTHS
+        A = A.reshape(contacts.n_c, 6, S.shape[1]) / _LENGTHS
         self.normal_rate = A[:, 0]  # how fast the finger nears the object
         mu_s, gamma, self.frame = (np.asarray(x) for x in (near.friction, near.torsional_friction, kin.frame))
         # where a contact slides, its point moves over the object by M K_f v and over the finger by -M K_o v
