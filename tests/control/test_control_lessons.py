@@ -147,5 +147,5 @@ def test_a_finger_that_slid_or_gave_its_load_away_says_nothing_of_forces(held, l
         seen, q=state.q, position=state.position, rotation=state.rotation, fingertip_force=force
     )
     lessons = Lessons(controller, loop.knowledge, loop.knowledge.figures)
-    lessons.learn(seen, decision, after, decision.delta_a, expected)
+    lessons.learn(seen, decision, after, decision.delta_a, expected, True)
     assert bool(loop.knowledge.forces.evidence.any()) is learns

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 
 from ..control.safety import Guards
-from ..control.safety.readings import ReadingTests
+from ..control.safety.readings import ReadingTests, stated
 from ..enhanced import EnhancedModel
 from ..exceptions import ParameterError
 from ..model import KinematicModel
@@ -93,7 +93,7 @@ class BlindPose(PlantWrapper):
             self._before, self._sent = seen, None
             self.dark = self._switch_off is None or self._switch_off(seen)
             if self.dark:
-                self.filter.start(seen.state, seen.fingertip_force, _covariance(seen))
+                self.filter.start(seen.state, seen.fingertip_force, stated(seen))
             return seen
         if accepted:
             if self._sent is not None and before is not None:
@@ -104,9 +104,10 @@ class BlindPose(PlantWrapper):
         looked = accepted and self.axis_std > self.look_again and seen.status is PlantStatus.HELD
         if looked:
             self.looks += 1
-            self.filter.look(seen.state, _covariance(seen))
+            self.filter.look(seen.state, stated(seen))
         at, P = self.filter.state, self.filter.pose_covariance
         estimate = {"pose_covariance": P, "axis_std": self.axis_std, "looked": looked}
+        estimate = seen.info.get("estimate", {}) | estimate
         # a dark camera cannot say that it does not see the object
         status = PlantStatus.HELD if seen.status is PlantStatus.NOT_SEEN else seen.status
         # estimated for now: it is no stale picture
@@ -118,9 +119,5 @@ class BlindPose(PlantWrapper):
             rotation=at.rotation,
             status=status,
             stamps=stamps,
-            info={**seen.info, "estimate": {**seen.info.get("estimate", {}), **estimate}},
+            info={**seen.info, "estimate": estimate},
         )
-
-
-def _covariance(seen: Observation) -> Tensor | None:
-    return seen.info.get("estimate", {}).get("pose_covariance")

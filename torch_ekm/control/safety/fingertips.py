@@ -29,13 +29,8 @@ _R, _E = StopReason, Effect
 
 
 class FingertipTests:
-    """Of one manipulation.
-
-    Args:
-        guards: limits.
-        model: f, with the hand.
-        usual: how many times the fingertips of this hand read what joints and springs give; None: unknown.
-    """
+    """Of one manipulation. The fingertips of this hand are ``usual`` to read so many times what joints and
+    springs give; None: that is unknown."""
 
     def __init__(self, guards: Guards, model: KinematicModel, usual: float | None) -> None:
         self.guards, self.hand, self.model, self._usual = guards, model.hand, model, usual

@@ -27,12 +27,7 @@ _TWICE = math.sqrt(2)  # times the noise of a reading that of a difference is
 
 
 class ReadingTests:
-    """Tests of readings against :class:`~torch_ekm.control.Guards`.
-
-    Args:
-        guards: limits.
-        hand: gives names and ranges of encoders and joints.
-    """
+    """Tests of readings against :class:`~torch_ekm.control.Guards`; the hand gives names and ranges."""
 
     def __init__(self, guards: Guards, hand: HandDescription) -> None:
         self.guards, self.hand = guards, hand
@@ -57,7 +52,7 @@ class ReadingTests:
         pose came before."""
         said = self._ages(seen, before)
         unseen = bool(said)  # the rest is still looked at
-        said += [*self.motors(before, sent, seen), *self._speed(before, seen)]
+        said += [*self.motors(before, sent, seen)]
         if expected is not None:
             ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
             said += self._jumps(ds, predicted, seen, unseen)
@@ -130,15 +125,6 @@ class ReadingTests:
         mirrored = ((moved * v)[sent_off] < 0).all() and (abs(moved) - abs(v)).max() <= guards.unchanged
         return said + (wrong_way + jumped if mirrored else jumped + wrong_way)
 
-    def _speed(self, before: Observation, seen: Observation) -> list[Objection]:
-        if not (seen.dated and before.dated):
-            return []
-        moved, most = (seen.a - before.a).numpy(), self.guards.speed
-        seconds, i = max(seen.taken.encoders - before.taken.encoders, 0.0), int(abs(moved).argmax())
-        fast = f"encoder '{self.hand.actuator_names[i]}' went {deg(moved[i])} in {seconds:.3g} s "
-        fast += f"(Guards.speed is {deg(most)}/s): the driver must wait for the end of a motion, and date it"
-        return against(abs(moved[i]) > most * seconds, StopReason.SPEED_CEILING, fast)
-
     def _jumps(self, ds: Array, predicted: Array, seen: Observation, unseen: bool = False) -> list[Objection]:
         """What no motion does; of a pose that is not seen: nothing."""
         guards, off, n_q = self.guards, ds - predicted, self.hand.n_q
@@ -181,7 +167,7 @@ class ReadingTests:
         """Variances of a measured increment ``(n_s,)``; of poses as stated, and no less than the guards'."""
         least = np.array(_pose_std(self.guards)) ** 2
         pose = 0 * least
-        for cov in (_stated(before), _stated(seen)):
+        for cov in (stated(before), stated(seen)):
             pose += least if cov is None else np.maximum(np.nan_to_num(cov.diagonal().numpy()), least)
         return np.concatenate([np.full(self.hand.n_q, 2 * self.guards.joint_noise**2), pose])
 
@@ -194,7 +180,7 @@ class ReadingTests:
 
     def pose_noise(self, seen: Observation, focus: FocusedPose) -> float:
         """Standard deviation of a pose in the focus, as a turn [rad]: as stated, or the guards'."""
-        cov = _stated(seen)
+        cov = stated(seen)
         if cov is None or not bool(torch.isfinite(cov).all()):
             cov = torch.diag(torch.tensor(_pose_std(self.guards)).double().square())
         M = focus.matrix
@@ -229,6 +215,6 @@ def _pose_std(guards: Guards) -> list[float]:
     return [guards.translation_noise] * 3 + [NOISE.rotation] * 3
 
 
-def _stated(seen: Observation) -> Tensor | None:
+def stated(seen: Observation) -> Tensor | None:
     """Covariance of its pose, as the plant states it."""
     return seen.info.get("estimate", {}).get("pose_covariance")
