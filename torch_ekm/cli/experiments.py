@@ -32,7 +32,7 @@ def demo(
     """Turn an object with the KM and with the E-KM, then objects that are new to the hand, and report.
 
     Eight instances of the simulated hand, five turns from new grasps with each controller; then four more
-    objects with the first of them: three to four minutes on two cores; half a minute with --quick.
+    objects with the first of them: two to three minutes on two cores; half a minute with --quick.
     Interrupted, it continues where it stopped.
     """
     from ..experiments.config import Setting
