@@ -303,6 +303,11 @@ def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
     assert report.tables()[0].rows[0][0] in ("default", "default *")
 
 
+def test_a_folder_is_a_recording_of_ros_that_needs_a_clock(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="--clock"):
+        load_recording(tmp_path)
+
+
 def test_errors_of_each_output_are_given_in_the_units_of_the_file(tmp_path: Path) -> None:
     values = table() * [1.0, 1.0, 1e-3, 50.0]  # two predictions, and two measurements in other units
     values[:, 2:] += 4.0 * values[:, :2] * [1e-3, 50.0]

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from .._terminal import print_report, progress, say, say_next
+from .._terminal import console, print_report, progress, say, say_next
 from ..exceptions import ParameterError
 from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, parse_angles, parse_seeds
 
@@ -16,8 +16,8 @@ from typer import Argument, Option  # isort: skip
 if TYPE_CHECKING:
     from ..experiments.reproduce import Experiment
 
-#: Seconds on one free core: of a session, else 20; of a quick one; of a learner on 1500 rows.
-_SESSION, _QUICK, _LEARNER = {"online": 70}, 8, 10
+#: Seconds on one free core: of a session, else 20; of a quick one; of a learner with a row.
+_SESSION, _QUICK, _LEARNER = {"online": 70}, 8, 0.006
 
 
 @app.command()
@@ -32,7 +32,7 @@ def demo(
     """Turn an object with the KM and with the E-KM, then objects that are new to the hand, and report.
 
     Eight instances of the simulated hand, five turns from new grasps with each controller; then four more
-    objects with the first of them: three to four minutes on two cores; half a minute with --quick.
+    objects with the first of them: two to three minutes on two cores; half a minute with --quick.
     Interrupted, it continues where it stopped.
     """
     from ..experiments.config import Setting
@@ -129,6 +129,7 @@ def compare(
     santafe (steven2358/kafbox).
     """
     from ..experiments import compare as run
+    from ..experiments.learner_comparison.recordings import load_recording
     from ..experiments.learners import COMPARED
 
     chosen = names(learners) if learners else COMPARED
@@ -137,22 +138,13 @@ def compare(
     if jobs > 1 and find_spec("joblib") is None:
         say("One process at a time: joblib, of the extra 'experiments', is not installed.")
         jobs = 1
-    n = len(data) * len(chosen)
-    with progress("comparing", n, n * _LEARNER * limit / 1500 / jobs) as advance:
-        compared = run(
-            data,
-            chosen,
-            targets=names(targets),
-            inputs=names(inputs),
-            predicted=names(predicted),
-            observation=names(observation),
-            run=run_column,
-            clock=clock,
-            limit=limit or None,
-            folder=out / "runs",
-            processes=jobs,
-            on_done=advance,
-        )
+    columns = {"targets": names(targets), "inputs": names(inputs), "predicted": names(predicted)}
+    columns |= {"run": run_column, "clock": clock}
+    with console.status("reading"):  # simulated_hand is made, which takes a minute
+        streams = [load_recording(one, limit or None, names(observation), **columns) for one in data]
+    seconds = _LEARNER * sum(map(len, streams)) * len(chosen) / jobs
+    with progress("comparing", len(data) * len(chosen), seconds) as advance:
+        compared = run(streams, chosen, folder=out / "runs", processes=jobs, on_done=advance)
     print_report(compared.write(out), out, notes=True)
     best = dict.fromkeys(compared.best(stream.name).learner for stream in compared.streams)
     say(f"Best:      {', '.join(best)}")

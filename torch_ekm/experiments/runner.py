@@ -152,9 +152,7 @@ class Bench:
         if touch is not None:
             plant = BlindPose(plant, self._predictor, axis, touch=touch)
         self.last = self.closed_loop(plant, learn=learn).run(target)
-        if (
-            self.last.stop.cause is not None
-        ):  # one that Ctrl-C or a failure of the plant cut short is no trial
+        if self.last.stop.cause is not None:  # Ctrl-C, or a failure of the plant: this is no trial
             raise self.last.stop.cause
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 

@@ -189,7 +189,7 @@ def significance_table(trials: DataFrame) -> Table:
         won = ekm[seeds] < km[seeds]
         lost = [f"{cell[0]}, trial {cell[1] + 1} ({n})" for cell, n in (~won).sum(axis=1).items() if n]
         until = np.median([stats.learning_curve(*hand).last_negative for hand in hands])
-        wins, units = won.sum(), tables.paired(chosen, "E-KM", "KM", "error_deg")
+        wins, units = won.sum(), tables.paired(chosen, "E-KM", "KM")
         rows = [
             ["cells won", "24 of 25", f"{wins.median():g} of {len(won)}, least {wins.min()}"],
             ["cells lost (hands)", "can, trial 2", "; ".join(lost) or "none"],
