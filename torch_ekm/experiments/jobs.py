@@ -24,6 +24,7 @@ from .._extras import require
 from .._files import WriterLock, make_folder, write_whole
 from .._warnings import warn
 from ..exceptions import WorkerDiedError
+from ..residual import warm_up
 
 Jobs = Mapping[str, tuple[Any, ...]]
 Outcomes = Generator[tuple[str, Any], None, None]
@@ -72,6 +73,8 @@ def run_jobs(
         for name in results:
             report(name)
         waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
+        if waiting:
+            warm_up()  # else results would depend, by rounding, on when the loops are compiled
         with closing(_in_processes(processes, function, waiting)) as outcomes:
             for name, result in outcomes:
                 text = _text(name, result)
