@@ -214,6 +214,7 @@ class ClosedLoop:
         self.knowledge.error.begin()
         self.controller.tighter = float(self.knowledge.error.tighter)
         self._figures.begin(seen.a)
+        self._lessons.begin()
         ends = Ends(self.safety.rule, target, self.controller, seen)
         grips = turns = 0
         decision = None
@@ -236,6 +237,8 @@ class ClosedLoop:
                 firm = _LEAST if grips < _AGAIN and decision is not None and decision.turns else 0.0
             else:
                 firm = _FULL if grips < _GRIPS else _ANY if grips < _AGAIN else 0.0
+            if self.learn:
+                self._lessons.touch(seen)
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
