@@ -11,11 +11,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from own_files import change, copied
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.control import ClosedLoop
+from torch_ekm.control.reach import Reachability
 from torch_ekm.description import list_hands, load_hand, load_object
 from torch_ekm.exceptions import GraspError
 from torch_ekm.inspection import check as module
@@ -198,6 +200,12 @@ def test_a_pinch_that_turns_little_is_told(most, state, monkeypatch):
     monkeypatch.setattr(ClosedLoop, "reach", lambda _, sign: SimpleNamespace(angle=turns[sign], end="end"))
     (row,) = module._turn(HAND, load_object("can"))
     assert (row.state, row.found) == (state, "predicted: -9 deg (end), +3 deg (end)")
+    few = Reachability(torch.zeros(1), "the motors come 8 % of the way: choose another")
+    monkeypatch.setattr(ClosedLoop, "reachability", lambda *_: few)
+    (row,) = module._turn(HAND, load_object("can"))
+    told = "predicted: -9 deg (end), +3 deg (end)"
+    told += "; the motors come 8 % of the way" if state == "warning" else ""
+    assert (row.state, row.found) == (state, told)
 
 
 @pytest.mark.usefixtures("brief")
