@@ -263,7 +263,9 @@ def wrong_wirings() -> tuple[int, int]:
     chosen = "is_refused_with_the_line or dead_joint or undated or another_frame"
     command = [sys.executable, "-m", "pytest", "-q", "-k", chosen, "-o", "addopts=", "--no-header", str(test)]
     said = subprocess.run(command, capture_output=True, text=True, check=False, cwd=test.parents[2]).stdout
-    passed, failed = (sum(map(int, re.findall(rf"(\d+) (?:{how})", said))) for how in ("passed", "failed|error"))
+    passed, failed = (
+        sum(map(int, re.findall(rf"(\d+) (?:{how})", said))) for how in ("passed", "failed|error")
+    )
     return passed, passed + failed
 
 

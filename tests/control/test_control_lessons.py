@@ -20,6 +20,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control.lessons import Lessons
 from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.model import KinematicModel
 
 DEG = math.pi / 180
 
@@ -149,3 +150,31 @@ def test_a_finger_that_slid_or_gave_its_load_away_says_nothing_of_forces(held, l
     lessons = Lessons(controller, loop.knowledge, loop.knowledge.figures)
     lessons.learn(seen, decision, after, decision.delta_a, expected, True)
     assert bool(loop.knowledge.forces.evidence.any()) is learns
+
+
+def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
+    """The box is 4.5 mm wider than it is described; each reading counts, and a manipulation begins anew."""
+    seen, axis, model = held
+    shapes = tuple(shape.scaled(0.85) for shape in model.obj.shapes)
+    thin = KinematicModel(model.hand, dataclasses.replace(model.obj, shapes=shapes))
+    for told, figures, surface in (
+        (thin, HandFigures.of(model.hand), 0.00225),
+        (thin, DescribedFigures(), 0.0),
+        (model, HandFigures.of(model.hand), 0.0),
+    ):
+        controller = LookAndMoveController(EnhancedModel.for_grasp(told, seen.state), axis)
+        controller.follow(figures)
+        lessons = Lessons(controller, HandKnowledge.of(model.hand), figures)
+        lessons.touch(seen)
+        followed = controller.kinematic
+        assert followed.surface == pytest.approx(surface, abs=0.0005)
+        if surface:
+            gaps = followed.contacts(seen.state, seen.fingertip_force).gap
+            assert (
+                float(gaps.abs().max())
+                < 0.0005
+                < float(thin.contacts(seen.state, seen.fingertip_force).gap.min())
+            )
+        assert told.surface == 0.0
+        lessons.begin()
+        assert followed.surface == 0.0

@@ -198,6 +198,12 @@ def test_a_pinch_that_turns_little_is_told(most, state, monkeypatch):
     monkeypatch.setattr(ClosedLoop, "reach", lambda _, sign: SimpleNamespace(angle=turns[sign], end="end"))
     (row,) = module._turn(HAND, load_object("can"))
     assert (row.state, row.found) == (state, "predicted: -9 deg (end), +3 deg (end)")
+    few = "the motors come 8 % of the way: choose another"
+    monkeypatch.setattr(module, "out_of_reach", lambda *_: few)
+    (row,) = module._turn(HAND, load_object("can"))
+    told = "predicted: -9 deg (end), +3 deg (end)"
+    told += "; the motors come 8 % of the way" if state == "warning" else ""
+    assert (row.state, row.found) == (state, told)
 
 
 @pytest.mark.usefixtures("brief")

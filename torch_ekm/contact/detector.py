@@ -6,6 +6,7 @@ because the witness points of a distance query jump along a line of contact.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Collection
 from typing import Any
@@ -127,6 +128,12 @@ class ContactDetector:
         found, _ = self._of_pads(frames, solids, margin, pressing, measured=False)
         links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
         return self._contact_set(found, [], position.dtype, position.device, links)
+
+    def grown(self, distance: float) -> ContactDetector:
+        """The same of an object whose surface is farther out by ``distance`` [m]."""
+        made = copy.copy(self)
+        made._shapes = [Solid(self._coal, shape.grown(distance)) for shape in self.obj.shapes]
+        return made
 
     def _placed(
         self, q: LinkPoses | Tensor, position: Tensor, rotation: Tensor

@@ -195,6 +195,7 @@ class ClosedLoop:
         self.knowledge.error.begin()
         self.controller.reset(float(self.knowledge.error.tighter))
         self._figures.begin(seen.a)
+        self._lessons.begin()
         ends = Ends(self.safety.rule, target, self.controller, seen)
         grips = turns = 0
         decision = None
@@ -213,6 +214,8 @@ class ClosedLoop:
                 return over
             began = time.perf_counter()
             firm = _FIRM[grips] if grips < len(_FIRM) and not turns else 0.0
+            if self.learn:
+                self._lessons.touch(seen)
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import statistics
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from .._noise import NOISE
+from ..contact import ContactDetector
 from ..plant import Observation, PlantStatus
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
 _SLIPS, _OF_WAY = 3.0, 0.15  # noises, and share of the way of f + g, from which an object is thought to slide
 _OF_IT, _WRONG = 0.25, 3.0  # share of what a finger bears that is no surprise; deviations that are one
+_SENSED = 1e-3  # [m] of the surface, below which sensors are thought to be off: three deviations of a median
 
 
 class ForceChange(NamedTuple):
@@ -60,6 +63,25 @@ class Lessons:
         figures: HandFigures | DescribedFigures,
     ) -> None:
         self._controller, self._knowledge, self._figures = controller, knowledge, figures
+        self._gaps: list[float] = []  # [m]
+
+    def begin(self) -> None:
+        """A manipulation begins; the object may be another one."""
+        self._gaps, self._controller.kinematic.surface = [], 0.0
+
+    def touch(self, seen: Observation) -> None:
+        """Where the object's surface is, by the gaps of the pads that press: the median of each reading, for
+        one pad may be off alone, and the mean of readings."""
+        model, force = self._controller.kinematic, seen.fingertip_force
+        if not self._figures.learns or force is None or not isinstance(model.detector, ContactDetector):
+            return
+        names = [pad.name for pad, f in zip(model.hand.pads, force, strict=True) if f > NOISE.pressing]
+        found = model.detector(seen.q, seen.position, seen.rotation, names)
+        gaps = [g for name, g in zip(found.finger, found.gap.tolist(), strict=True) if name in names]
+        if len(gaps) > 1:
+            self._gaps.append(statistics.median(gaps))
+            mean = statistics.fmean(self._gaps)
+            model.surface = mean if abs(mean) > _SENSED else 0.0
 
     def learn(
         self,

@@ -15,7 +15,8 @@ import torch
 from ..contact import ContactSet
 from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
-from ..control import ClosedLoop, LookAndMoveController
+from ..control import ClosedLoop, LookAndMoveController, PoseTarget
+from ..control.reach import out_of_reach
 from ..description import ContactPad, HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, EquilibriumError, GraspError, MissingExtraError
 from ..kinematics import ActuationMap, HandKinematics, LinkPoses
@@ -245,11 +246,13 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     remedy = "stiffer springs, another 'pinch_force', more friction, wider limits"
     try:
         plant = SimulatedHand(hand, obj)
-        plant.reset(0)
+        seen = plant.reset(0)
         model = KinematicModel(plant.hand, obj)
         controller = LookAndMoveController(model, plant.rotation_axis)
         loop = ClosedLoop(plant, controller)
         ends = [loop.reach(sign=sign) for sign in (-1, 1)]
+        turn = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=math.degrees(_LITTLE_TURN))
+        few = out_of_reach(controller, seen, turn).partition(":")[0]
     except MissingExtraError:
         return
     except EKMError as error:
@@ -257,6 +260,8 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         return
     found = ", ".join(f"{round(math.degrees(end.angle)):+d} deg ({end.end})" for end in ends)
     little = min(abs(end.angle) for end in ends) < _LITTLE_TURN
+    if few and little:
+        found, remedy = f"{found}; {few}", "motors that move pads along the object: these press it"
     yield Check("turn", "warning" if little else "ok", f"predicted: {found}", remedy if little else "")
 
 

@@ -76,6 +76,8 @@ class KinematicModel(nn.Module):
     """Of the object, in its own frame [m]."""
     figures: FollowedFigures | None = None
     """What J_m follows in place of the description, see :meth:`with_figures`."""
+    surface: float = 0.0
+    """How much farther out the object's surface is than described [m]; a loop that learns sets it."""
     plane: Float[Tensor, " 3"] | None
     """Normal of a planar hand's plane; None: a spatial hand."""
     precedes: Bool[Tensor, "n_q n_q"]
@@ -100,6 +102,7 @@ class KinematicModel(nn.Module):
         if detector is None:
             detector = ContactDetector(hand, obj, self.options.contact_margin, kinematics=self.kinematics)
         self.detector = detector
+        self._grown: tuple[float, ContactDetector] | None = None
         self.link_names = tuple(self.kinematics.link_names)
         self.reduction = Reduction(hand, self.options, dtype)
         self.balance = ForceBalance(hand, self.options, self.reduction)
@@ -125,6 +128,15 @@ class KinematicModel(nn.Module):
         )  # fmt: skip
         object.__setattr__(made, "figures", figures)  # they belong to the hand, not to the model's state
         return made
+
+    @property
+    def touch_detector(self) -> Detector:
+        """The detector, of an object whose surface is ``surface`` farther out."""
+        if not self.surface or not isinstance(self.detector, ContactDetector):
+            return self.detector
+        if self._grown is None or self._grown[0] != self.surface:
+            self._grown = self.surface, self.detector.grown(self.surface)
+        return self._grown[1]
 
     def followed(self, lin: Linearization) -> Linearization:
         """The same state with J_m of the present figures."""
@@ -173,7 +185,7 @@ class KinematicModel(nn.Module):
     def _detect(
         self, state: GraspState, poses: LinkPoses | None, fingertip_force: Tensor | None
     ) -> ContactSet:
-        detector, place = self.detector, (state.position, state.rotation)
+        detector, place = self.touch_detector, (state.position, state.rotation)
         with torch.no_grad():
             if isinstance(detector, ContactDetector):
                 at = state.q if poses is None else poses
@@ -202,12 +214,12 @@ class KinematicModel(nn.Module):
         Raises:
             NoContactError: nothing touches the object.
         """
-        contacts = self.contacts(state, fingertip_force)
-        if not isinstance(self.detector, ContactDetector):
+        contacts, detector = self.contacts(state, fingertip_force), self.touch_detector
+        if not isinstance(detector, ContactDetector):
             return contacts
-        margin = max(self.detector.margin, TOUCHING)
+        margin = max(detector.margin, TOUCHING)
         pressing = self._pressing(fingertip_force)
-        near = self.detector.near(state.q, state.position, state.rotation, margin, pressing)
+        near = detector.near(state.q, state.position, state.rotation, margin, pressing)
         pads = len(contacts.finger)  # they come first, in the same order
         links = [i for i in range(pads, near.n_c) if float(near.gap[i]) < TOUCHING]
         return near.select([*range(pads), *links])

@@ -367,7 +367,7 @@ class ContactMotion:
         )
 
     def _place(self, state: GraspState) -> PlacedGrasp:
-        model, detector = self.model, self.model.detector
+        model, detector = self.model, self.model.touch_detector
         poses = model.kinematics(state.q)
         if isinstance(detector, ContactDetector):
             contacts = detector.near(poses, state.position, state.rotation, NEAR, self.loads.force)

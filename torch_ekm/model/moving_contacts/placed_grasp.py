@@ -34,10 +34,12 @@ class GraspModel(Protocol):
     hand: HandDescription
     options: ModelOptions
     kinematics: Kinematics
-    detector: Detector
     reduction: Reduction
     spring_rest: Tensor
     figures: FollowedFigures | None
+
+    @property
+    def touch_detector(self) -> Detector: ...
 
     def contact_kinematics(
         self, state: GraspState, contacts: ContactSet, *, poses: LinkPoses | None = None
