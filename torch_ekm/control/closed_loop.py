@@ -238,7 +238,7 @@ class ClosedLoop:
             else:
                 firm = _FULL if grips < _GRIPS else _ANY if grips < _AGAIN else 0.0
             if self.learn:
-                self._lessons.touch(seen)
+                self._lessons.touch(seen, watch.motions.closest)
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:

@@ -150,6 +150,11 @@ class MotionTests:
                 return f"fingertips press ({', '.join(away)}) where pose and joints have them off the object"
         return ""
 
+    def closest(self, seen: Observation) -> float:
+        """How far the pads that press are from the surface, rms, if all joints are off by what brings them
+        closest [m]."""
+        return min(self._distance(seen, float(c)) for c in _OFFSETS)
+
     def on_surface(self, seen: Observation) -> bool:
         """The pads that press lie on the object, as joints and pose have them."""
         return self._distance(seen) <= _GAP
