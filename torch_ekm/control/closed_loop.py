@@ -215,7 +215,7 @@ class ClosedLoop:
             began = time.perf_counter()
             firm = _FIRM[grips] if grips < len(_FIRM) and not turns else 0.0
             if self.learn:
-                self._lessons.touch(seen)
+                self._lessons.touch(seen, watch.motions.closest)
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:

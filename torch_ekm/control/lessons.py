@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -69,9 +70,13 @@ class Lessons:
         """A manipulation begins; the object may be another one."""
         self._gaps, self._controller.kinematic.surface = [], 0.0
 
-    def touch(self, seen: Observation) -> None:
+    def touch(self, seen: Observation, otherwise: Callable[[Observation], float]) -> None:
         """Where the object's surface is, by the gaps of the pads that press: the median of each reading, for
-        one pad may be off alone, and the mean of readings."""
+        one pad may be off alone, and the mean of readings.
+
+        Args:
+            otherwise: what another explanation of the gaps leaves of them, rms [m]; the better one counts.
+        """
         model, force = self._controller.kinematic, seen.fingertip_force
         if not self._figures.learns or force is None or not isinstance(model.detector, ContactDetector):
             return
@@ -79,7 +84,10 @@ class Lessons:
         found = model.detector(seen.q, seen.position, seen.rotation, names)
         gaps = [g for name, g in zip(found.finger, found.gap.tolist(), strict=True) if name in names]
         if len(gaps) > 1:
-            self._gaps.append(statistics.median(gaps))
+            median = statistics.median(gaps)
+            if abs(median) > _SENSED and statistics.pstdev(gaps) > otherwise(seen):
+                return
+            self._gaps.append(median)
             mean = statistics.fmean(self._gaps)
             model.surface = mean if abs(mean) > _SENSED else 0.0
 

@@ -17,6 +17,7 @@ from .guards import Effect, Objection, against, deg
 from .readings import AGAINST, CHECK_PLANT, ReadingTests
 
 _NOWHERE = 0.5 * DEGREE  # an encoder moves less in a motion in which its motor is sent nowhere
+_OFFSETS = torch.arange(-8.0, 8.1, 0.5, dtype=torch.float64) * DEGREE  # of all joints, that are tried
 _GAP = 2e-3  # [m] of a pad from the object, from which it is suspicious
 _MAGNET = "it drifts, or slips; check its magnet and cable"
 
@@ -84,16 +85,24 @@ class MotionTests:
         """``a - a_0 - l(q)`` [rad]."""
         return seen.a.numpy() - self.hand.unloaded(seen.q.numpy())
 
+    def closest(self, seen: Observation) -> float:
+        """How far the pads that press are from the surface, rms, if all joints are off by what brings them
+        closest [m]; infinite: fewer than two press."""
+        tried = [list(self._gaps(seen, float(c)).values()) for c in _OFFSETS]
+        return min(math.hypot(*gaps) / math.sqrt(len(gaps)) if len(gaps) > 1 else math.inf for gaps in tried)
+
     def on_surface(self, seen: Observation) -> bool:
         """The pads that press lie on the object, as joints and pose have them."""
         gaps = self._gaps(seen)
         return len(gaps) > 1 and max(gaps.values()) <= _GAP
 
-    def _gaps(self, seen: Observation) -> dict[str, float]:
-        """Distance of each pad that presses, or else is near, from the object [m]; infinite: far."""
+    def _gaps(self, seen: Observation, offset: float = 0.0) -> dict[str, float]:
+        """Distance of each pad that presses, or else is near, from the object [m], if all joints were off by
+        an angle [rad]; infinite: far."""
         gaps: dict[str, float] = {}
+        moves = torch.from_numpy(self.hand.joint_upper > self.hand.joint_lower)
         with contextlib.suppress(GraspError):
-            near = self.model.detector(seen.q, seen.position, seen.rotation)
+            near = self.model.detector(seen.q + offset * moves, seen.position, seen.rotation)
             gaps = dict(zip(near.finger, near.gap.abs().tolist(), strict=True))
         if seen.fingertip_force is None:
             return gaps
