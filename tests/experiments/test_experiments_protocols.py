@@ -154,8 +154,8 @@ def test_every_controller_gets_the_same_grasps_and_targets(online: dict[str, lis
 def test_learner_starts_empty_and_is_trained(online: dict[str, list[TrialRecord]]) -> None:
     first, second = online["E-KM"]
     assert first.prediction_ekm_deg[0] == pytest.approx(
-        first.prediction_km_deg[0], abs=0.05
-    )  # pieces compose
+        first.prediction_km_deg[0], abs=0.1
+    )  # a bent path, in several pieces and in one
     assert second.prediction_ekm_deg[0] != pytest.approx(second.prediction_km_deg[0], rel=1e-3)
     assert online["KM+I"][0].prediction_ekm_deg == ()
     assert len(first.true_prediction_ekm_deg) == len(first.prediction_ekm_deg) == first.steps

@@ -14,9 +14,10 @@ from ...plant import Observation
 from ...typing import Array, Tensor
 from ..decision import Expectation, StopReason
 from .guards import Effect, Objection, against, deg
-from .readings import AGAINST, CHECK_PLANT, ReadingTests
+from .readings import CHECK_PLANT, ReadingTests
 
 _NOWHERE = 0.5 * DEGREE  # an encoder moves less in a motion in which its motor is sent nowhere
+_AGAINST = 0.3  # share of a motion that is made the other way; healthy hands make .4 of it and more
 _OFFSETS = torch.arange(-8.0, 8.1, 0.5, dtype=torch.float64) * DEGREE  # of all joints, that are tried
 _GAP = 2e-3  # [m] of a pad from the object, from which it is suspicious
 _MAGNET = "it drifts, or slips; check its magnet and cable"
@@ -38,7 +39,7 @@ class MotionTests:
         self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation | None
     ) -> list[Objection]:
         """Encoders that drift, and joints and object that go another way than the encoders."""
-        names, moved = self.hand.actuator_names, (seen.a - before.a).where(sent == 0, 0.0)
+        names, moved = self.hand.actuator_names, (seen.a - before.a).where((sent == 0).all(0), 0.0)
         i = int(moved.abs().argmax())
         drifts = f"encoder '{names[i]}' went {deg(moved[i])} though its motor was sent nowhere (limit "
         drifts += f"{deg(_NOWHERE)}): {_MAGNET}"
@@ -48,9 +49,9 @@ class MotionTests:
             return said
         share, sharp = self.readings.share(before, seen, expected.nominal)
         back = f"joints and object made {share:.1f} of the motion that the encoders' motion predicts (limit "
-        back += f"-{AGAINST:g}): a sign of motors, encoders or joints is wrong, or the pose's frame; "
+        back += f"-{_AGAINST:g}): a sign of motors, encoders or joints is wrong, or the pose's frame; "
         back += CHECK_PLANT
-        wrong = -share > AGAINST and sharp >= self.guards.gate
+        wrong = -share > _AGAINST and sharp >= self.guards.gate
         return said + against(wrong, StopReason.WRONG_WAY, back, Effect.UNLEARNED, running=2)
 
     @property

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _SENSORS = "the encoders' reading", "the joints' reading", "the object's pose"
 _DRIVER = "check its driver or its time stamps"
 CHECK_PLANT = "see 'torch-ekm check --plant'"
-AGAINST = 0.3  # share of a motion that is made the other way; healthy hands make .4 of it and more
+_MIRRORED = 0.5  # of the distance from a path, within which of its mirror image motors have gone back
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
 _TWICE = math.sqrt(2)  # times the noise of a reading that of a difference is
 
@@ -93,7 +93,7 @@ class ReadingTests:
         return joint > _TWICE * self.guards.joint_noise and not agree(one, other, self.guards)
 
     def motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> list[Objection]:
-        """Ranges, and encoders after the motors were sent by ``sent`` [rad]; None: nowhere."""
+        """Ranges, and encoders after the motors were sent through ``sent`` [rad]; None: nowhere."""
         hand, guards, said = self.hand, self.guards, []
         for what, names, lower, upper, value in (
             ("encoder", hand.actuator_names, hand.actuator_lower, hand.actuator_upper, seen.a),
@@ -107,8 +107,8 @@ class ReadingTests:
             said += against(beyond[i] > guards.beyond, StopReason.OUT_OF_RANGE, out)
         if before is None:
             return said
-        moved, v = (seen.a - before.a).numpy(), np.zeros(len(seen.a)) if sent is None else sent.numpy()
-        most = guards.unchanged if sent is None else guards.encoder_jump
+        moved, way = (seen.a - before.a).numpy(), np.zeros((1, len(seen.a))) if sent is None else sent.numpy()
+        v, most = way[-1], guards.unchanged if sent is None else guards.encoder_jump
         away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))  # further than sent, or back
         i = int(away.argmax())
         jump = f"encoder '{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
@@ -116,14 +116,16 @@ class ReadingTests:
         jumped = against(away[i] > most, StopReason.ENCODER_JUMP, jump)
         if abs(v).max() < guards.unchanged:
             return said + jumped
-        share, i = float(moved @ v) / float(v @ v), int((moved * v).argmin())
-        back = f"encoders made {share:.1f} of the motion that was commanded (limit -{AGAINST:g}): "
+        # no share of the path: a movement that was ended on the way, or an encoder that jumps, has any
+        (off, mirrored), i = (_off_path(x, way) for x in (moved, -moved)), int((moved * v).argmin())
+        back = (
+            f"encoders made {moved @ v / (v @ v):.1f} of the motion that was commanded: they are {deg(off)} "
+        )
+        back += f"off its path and {deg(mirrored)} off its mirror image (limit {deg(guards.unchanged)}); "
         back += f"'{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were"
         back += f": a sign of the motors or of their encoders is wrong; {CHECK_PLANT}"
-        wrong_way = against(-share > AGAINST, StopReason.WRONG_WAY, back)
-        sent_off = abs(v) >= guards.unchanged  # all of these went back: no single encoder that jumps
-        mirrored = ((moved * v)[sent_off] < 0).all() and (abs(moved) - abs(v)).max() <= guards.unchanged
-        return said + (wrong_way + jumped if mirrored else jumped + wrong_way)
+        wrong = off > guards.unchanged and mirrored < _MIRRORED * off
+        return said + against(wrong, StopReason.WRONG_WAY, back) + jumped
 
     def _jumps(self, ds: Array, predicted: Array, seen: Observation, unseen: bool = False) -> list[Objection]:
         """What no motion does; of a pose that is not seen: nothing."""
@@ -201,6 +203,14 @@ class ReadingTests:
             return False, False
         stands = torch.equal(seen.position, last.position) and torch.equal(seen.rotation, last.rotation)
         return torch.equal(seen.q, last.q), stands
+
+
+def _off_path(x: Array, way: Array) -> float:
+    """Distance of a point from the line through the origin and waypoints ``(n, n_a)``."""
+    start = np.vstack([0.0 * x, way[:-1]])
+    along = way - start
+    share = ((x - start) * along).sum(1) / np.maximum((along * along).sum(1), 1e-12)
+    return float(np.linalg.norm(x - start - share.clip(0.0, 1.0)[:, None] * along, axis=1).min())
 
 
 def agree(one: Observation, other: Observation, guards: Guards) -> bool:
