@@ -18,8 +18,7 @@ from torch_ekm.control import (
     LookAndMoveController,
     PoseTarget,
 )
-from torch_ekm.control.knowledge import previous
-from torch_ekm.control.model_error import ModelError
+from torch_ekm.control.knowledge import ModelError, previous
 from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError

@@ -22,8 +22,7 @@ from ..kinematics import HandKinematics, LinkPoses
 from ..kinematics.hand_kinematics import Kinematics
 from ..typing import Array, Float, Tensor
 from .contact_set import LINK_MARGIN, ContactSet, NearMiss
-from .link_contact import LinkShapes
-from .pad_contact import Pad, PadContact, Solid, pad_contact
+from .pad_contact import LinkShapes, Pad, PadContact, Solid, pad_contact
 
 CROWN_RADIUS = 0.5
 """R, of a pad along its axis [m]."""

@@ -12,8 +12,15 @@ from .ends import Safety, StoppingRule
 from .focus import Direction, FocusedPose, PoseTarget
 from .journal import Journal
 from .knowledge import HandKnowledge
-from .limiting import LimitingFunction, StepBound
-from .limits import DEFAULT_LIMITS, ActuatorLimit, JointLimit, Limit, NormalForceLimit
+from .limits import (
+    DEFAULT_LIMITS,
+    ActuatorLimit,
+    JointLimit,
+    Limit,
+    LimitingFunction,
+    NormalForceLimit,
+    StepBound,
+)
 from .manipulation import Manipulation, Step, Stop
 from .model_hand import ModelHand
 from .plan import OneStep, Plan, Planner, WholeTurn

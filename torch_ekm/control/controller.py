@@ -19,8 +19,7 @@ from ..model import ContactMotion, KinematicModel, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, Piece, StopReason, made_of, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
-from .limiting import LimitingFunction, StepBound, contact_travel
-from .limits import DEFAULT_LIMITS, Limit
+from .limits import DEFAULT_LIMITS, Limit, LimitingFunction, StepBound, contact_travel
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
 from .situation import LinearizedModel, Situation
 from .tasks import DEFAULT_TASKS, Task

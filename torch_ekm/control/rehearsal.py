@@ -19,7 +19,7 @@ from ..typing import Tensor
 from .bands import lets_go
 from .decision import Decision, Piece, StopReason
 from .focus import PoseTarget
-from .limiting import LimitingFunction
+from .limits import LimitingFunction
 from .model_hand import ModelHand
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import torch
 
 from .._checks import check_positive
 from .._noise import DEGREE
-from .limiting import contact_travel
+from .limits import contact_travel
 from .qp import Equality, Squares, as_array
 from .situation import LinearizedModel, Situation, grip_shares
 

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from .._arrays import like, namespace
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from ..contact.forces.balance import BalanceEquations, ForceSolution, ForceStatus
-from ..contact.forces.friction import friction_cones, margins
+from ..contact.forces.problem import BalanceEquations, ForceSolution, ForceStatus, friction_cones, margins
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import AnyArray, Array, Bool, Float, Tensor

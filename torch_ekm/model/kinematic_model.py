@@ -19,7 +19,6 @@ from ..kinematics.grasp_state import A_STATE, GraspState
 from ..kinematics.hand_kinematics import HandKinematics, Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
 from .arms import Arms, arms_at, bends, over_posture
-from .checks import at_pads, check_contacts, check_described, check_inertia, check_state
 from .force_balance import ForceBalance
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
@@ -27,11 +26,15 @@ from .linearization import FollowedFigures, Linearization
 from .motion_equations import MotionEquations
 from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .options import ModelOptions
-from .reduction import Reduction
-from .sensitivity import sensitivities
-from .stiffness.geometric import geometric_stiffness, precedence
-from .stiffness.potential import gravity_gradient, gravity_hessian, spring_torque
-from .validity import find_doubts
+from .reduction import Reduction, sensitivities
+from .stiffness.potential import (
+    geometric_stiffness,
+    gravity_gradient,
+    gravity_hessian,
+    precedence,
+    spring_torque,
+)
+from .validity import at_pads, check_contacts, check_described, check_inertia, check_state, find_doubts
 
 TOUCHING = 0.2e-3
 """Gap of a link that counts as touching [m]."""

@@ -10,7 +10,7 @@ from .._warnings import warn
 from ..contact.contact_kinematics import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
-from ..estimation.update import update
+from ..estimation.parameter_filter import update
 from ..kinematics import HandKinematics
 from ..plant import Observation, Plant, PlantWrapper
 from ..typing import Float, Tensor

@@ -11,10 +11,8 @@ from ..._extras import require
 from ...exceptions import GraspError, StateError
 from ...typing import Array
 from ..kinematic_model import KinematicModel
-from .motions import Recording, rests
-from .parameters import Unknowns
-from .residuals import GROUPS, Evidence, Residuals
-from .result import Calibration
+from .parameters import Calibration, Unknowns
+from .residuals import GROUPS, Evidence, Recording, Residuals, rests
 
 _SMALLEST_NOISE = 1e-3  # of the standard deviations at the start: below, the model's own error is left
 _UNSENSED = 0.5  # of the force problem's standard deviations, where no sensor measures their scale

@@ -18,9 +18,8 @@ from ...kinematics.grasp_state import GraspState
 from ...kinematics.se3 import exp
 from ...typing import Array, Float, Tensor
 from .contact_laws import Response, StepSolution, solve
-from .mode_linearization import mode_linearization
 from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
-from .step_program import HandLaws, StepProgram, Way
+from .step_program import HandLaws, StepProgram, Way, mode_linearization
 
 if TYPE_CHECKING:
     from ..linearization import Linearization

@@ -8,8 +8,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ..._arrays import in_numpy
-from ...contact.contact_kinematics import ContactKinematics, full_grasp_matrix, full_hand_jacobian
-from ...contact.contact_model import ContactModel
+from ...contact.contact_kinematics import (
+    ContactKinematics,
+    ContactModel,
+    full_grasp_matrix,
+    full_hand_jacobian,
+)
 from ...contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet, Detector
 from ...description.hand import HandDescription
 from ...kinematics.grasp_state import GraspState
@@ -19,8 +23,7 @@ from ...typing import AnyArray, Array, Tensor
 from ..arms import arms_at, bends
 from ..linearization import FollowedFigures
 from ..options import ModelOptions
-from ..reduction import Reduction
-from ..sensitivity import normal_motion
+from ..reduction import Reduction, normal_motion
 
 L = CHARACTERISTIC_LENGTH
 _LENGTHS = np.array([L, L, L, 1.0, 1.0, 1.0])[:, None]

@@ -1,17 +1,79 @@
-"""Potential energy of springs and gravity, its gradient and its second-order terms.
-
-``V(q, p) = 1/2 (q - q0)^T K_s (q - q0) - m g . (o + R c)``; the weight of the links is left out.
-
-One convention for everything of second order: the components of the gradient are differentiated
-along ``dp = (do, dphi)``, world axes, about the object point ("moving frame"). The blocks are not symmetric
-by themselves; their antisymmetric parts cancel in the sum at an equilibrium.
-"""
+"""The stiffness of a grasp: curvature of contacts, tendons and loops, of the potential."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from ..._arrays import like, namespace
+from ...contact.contact_kinematics import ContactKinematics
 from ...kinematics.se3 import cross, hat
 from ...typing import AnyArray, Bool, Float, Tensor
+
+
+def precedence(upstream: Bool[Tensor, "n_link n_q"]) -> Bool[Tensor, "n_q n_q"]:
+    """``[a, b]``: joint a is proximal to joint b on the same branch, or equal to it.
+
+    That is so where a moves every link that b moves.
+    """
+    moved = upstream.mT
+    return (moved[:, None, :] | ~moved[None, :, :]).all(-1)
+
+
+def geometric_stiffness(
+    kin: ContactKinematics,
+    force: Float[AnyArray, "*batch n_c 3"],
+    spin_moment: Float[AnyArray, "*batch n_c"],
+    precedes: Bool[Tensor, "n_q n_q"],
+) -> Float[AnyArray, "*batch n_s n_s"]:
+    """``dF/ds`` at constant contact forces: hand part S, object part T, rolling and soft-finger spin.
+
+    ```
+      sum_i blkdiag(S_i + W_i, 0, -[f_i]x [r_i]x)
+    + sum_i Omega_i^T [f_i]x M_i [n_i]x Omega_i                                   rolling, M = (K_f + K_o)^+
+    + sum_i Omega_i^T (-[m_i]x Omega_o + mu_4i K_o,i M_i [n_i]x Omega_i)          soft finger
+    S_i[a, b] = f_i . (z_a x (z_b x (x_i - o_b)))    a proximal to b or equal, symmetric
+    W_i[a, b] = (z_b x z_a) . m_i                    b strictly proximal to a, else 0
+    ```
+
+    Not symmetric for rolling or soft fingers in space, where the contacts are not holonomic.
+
+    Args:
+        kin: the contacts.
+        force: ``f_i`` of the finger on the object, hand axes [N], held constant there.
+        spin_moment: ``mu_4i`` about the inward normal [N m], held constant about the moving normal.
+        precedes: from :func:`precedence`.
+    """
+    n_q, xp = kin.axis.shape[-2], namespace(force)
+    D = xp.zeros((*force.shape[:-2], n_q + 6, n_q + 6), dtype=force.dtype, device=force.device)
+    f_hat = hat(force)
+    D[..., :n_q, :n_q] = posture_stiffness(force, kin.point_jacobian.mT, kin.axis, precedes)
+    D[..., n_q + 3 :, n_q + 3 :] = -(f_hat @ hat(kin.lever)).sum(-3)
+    Omega = kin.relative_spin
+    D = D + _over_contacts(Omega, (f_hat @ kin.roll) @ Omega)
+    if bool((spin_moment != 0).any()):
+        D = D + _spin_terms(kin, spin_moment, precedes)
+    return D
+
+
+def _over_contacts(left: AnyArray, right: AnyArray) -> Any:
+    """``sum_i left_i^T right_i`` as one product."""
+    left, right = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (left, right))
+    return left.mT @ right
+
+
+def _spin_terms(kin: ContactKinematics, spin_moment: AnyArray, precedes: Tensor) -> Any:
+    n_q, Omega = kin.axis.shape[-2], kin.relative_spin
+    moment = -kin.contacts.normal * spin_moment[..., None]
+    inner = 0 * Omega
+    inner[..., n_q + 3 :] = -hat(moment)
+    inner = inner + spin_moment[..., None, None] * (kin.contacts.object_curvature @ kin.roll @ Omega)
+    D = _over_contacts(Omega, inner)
+    # (z_b x z_a) . m = z_a . (m x z_b), for b strictly proximal to a, both upstream of the contact
+    J_w = kin.spin_jacobian
+    W = _over_contacts(J_w, hat(moment) @ J_w)
+    precedes = like(precedes, W)
+    D[..., :n_q, :n_q] += W * (precedes & ~precedes.mT).mT
+    return D
 
 
 def spring_torque(
