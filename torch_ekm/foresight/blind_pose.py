@@ -64,7 +64,7 @@ class BlindPose(PlantWrapper):
         self.dark, self.looks = False, 0
         """The camera is off; how often it was asked since."""
         self._tests = ReadingTests(Guards(), self.filter.kinematic.hand)
-        self._sent: Tensor | None = None  # of a motion from which no reading was accepted yet
+        self._sent: Tensor | None = None  # waypoints of motions from which no reading was accepted yet
         self._before: Observation | None = None
         """As measured, the last reading that was accepted."""
 
@@ -81,7 +81,8 @@ class BlindPose(PlantWrapper):
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
         after = self.plant.command(delta_a)
-        self._sent = delta_a if self._sent is None else self._sent + delta_a
+        last = self._sent if self._sent is not None else delta_a.new_zeros(1, len(delta_a))
+        self._sent = torch.cat([last, last[-1:] + delta_a])
         return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:

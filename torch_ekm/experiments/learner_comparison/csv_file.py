@@ -28,7 +28,7 @@ _LARGEST = 128 << 20  # bytes: a figure of one digit takes four times as much in
 _LONGEST = 1 << 20  # characters of one record, which is a line where no quoted text has line breaks
 _SEPARATORS = ",;\t "
 _EXCEL = re.compile(r'"?sep=([,;\t|:^~])"?', re.IGNORECASE)
-_TRIED = 6  # records that decide on the separator
+_TRIED, _LINES = 6, 1000  # records that decide on the separator, and lines in which they are looked for
 
 
 def open_csv(path: Path, label: str) -> tuple[Names, Read]:
@@ -45,12 +45,12 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
             it, too.
     """
     text = decode(read_file(path, "file of a table", _LARGEST), path)
+    if not text or text.isspace():
+        raise DescriptionError(path, "the file is empty")
     before, given = _preamble(text)
     tried = [partial(_records, path, text, before, one) for one in given or _SEPARATORS]
     records = max(tried, key=_fit)
     number, names = next(records(), (0, []))
-    if not names:
-        raise DescriptionError(path, "the file is empty")
     names = _trimmed(names, n := len(names) - 1)
     if all(figure(field) is not None for field in names):
         records = partial(_records, path, text, before - 1, records.args[-1])
@@ -64,7 +64,7 @@ def open_csv(path: Path, label: str) -> tuple[Names, Read]:
 def _fit(records: Records) -> tuple[bool, int]:
     """How well a separator does: whether the first lines have as many fields as the header, and how many."""
     try:
-        first = [row for _, row in itertools.islice(records(), _TRIED)]
+        first = [row for _, row in itertools.islice(records(most=_LINES), _TRIED)]
     except DescriptionError:
         return False, 1
     names = _trimmed(first[0], len(first[0]) - 1) if first else []
@@ -84,27 +84,30 @@ def _preamble(text: str) -> tuple[int, str]:
     return 0, separator
 
 
-def _records(path: Path, text: str, before: int, separator: str) -> Iterator[tuple[int, list[str]]]:
+def _records(
+    path: Path, text: str, before: int, separator: str, most: int | None = None
+) -> Iterator[tuple[int, list[str]]]:
     """Records that are not blank, with the number of their last line; the first may be a comment."""
-    length = 0
+    length = number = 0
 
-    def lines() -> Iterator[str]:
-        nonlocal length
-        for line in itertools.islice(io.StringIO(text, newline=""), before, None):
+    def lines() -> Iterator[str]:  # knows nothing of the reader: a circle would keep the text in memory
+        nonlocal length, number
+        for number, line in enumerate(
+            itertools.islice(io.StringIO(text, newline=""), before, None), before + 1
+        ):
             length += len(line)
             if length > _LONGEST:
                 problem = f"has more than {_LONGEST} characters, or stands in a quote that does not close"
-                raise DescriptionError(path, f"line {before + reader.line_num + 1} {problem}")
-            yield line.lstrip(" " if reader.line_num else "# ")
+                raise DescriptionError(path, f"line {number} {problem}")
+            yield line.lstrip(" " if number > before + 1 else "# ")
 
-    reader = csv.reader(lines(), delimiter=separator, skipinitialspace=True)
     try:
-        for row in reader:
+        for row in csv.reader(lines(), delimiter=separator, skipinitialspace=True):
             length = 0
             if len(row) > 1 or (row and row[0].strip()):
-                yield before + reader.line_num, [field.strip() for field in row]
+                yield number, [field.strip() for field in row]
     except csv.Error as error:
-        raise DescriptionError(path, f"line {before + reader.line_num}: {error}") from None
+        raise DescriptionError(path, f"line {number}: {error}") from None
 
 
 def _trimmed(row: list[str], n: int) -> list[str]:
