@@ -213,7 +213,10 @@ class ClosedLoop:
                     return over.told((grip and grip.waits) or self.plan(target).end.message)
                 return over
             began = time.perf_counter()
-            firm = _FIRM[grips] if grips < len(_FIRM) and not turns else 0.0
+            # after a movement that turned it is gripped again where a finger is weak, or the object may spin
+            tried = max(grips, 2) if turns else grips
+            again = tried < len(_FIRM) and (decision is None or decision.turns or not turns)
+            firm = _FIRM[tried] if again else 0.0
             if self.learn:
                 self._lessons.touch(seen, watch.motions.closest)
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
