@@ -73,9 +73,9 @@ class Rounded(PlantWrapper):
 
     def _followed(self, path: Waypoints, watch: Callable[[Observation], bool]) -> Observation:
         """Each waypoint as a command, as the hand behind the bus does."""
-        start, seen = self._round(self.plant.observe().a), self.observation(self.plant.observe())
+        start = seen = self.observation(self.plant.observe())
         for waypoint in path.waypoints:
-            seen = self.command(start + waypoint - seen.a)
+            seen = self.command(start.a + waypoint - seen.a)
         return seen
 
     def _edge(self, name: str) -> torch.Tensor:

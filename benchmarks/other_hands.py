@@ -16,7 +16,6 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib.pyplot as plt
 import numpy as np
 from made_hands import write_hands
 
@@ -25,6 +24,7 @@ from torch_ekm.control import ClosedLoop, LookAndMoveController, PoseTarget
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError
+from torch_ekm.experiments.reporting.plots import new_figure
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import PlantStatus
@@ -92,15 +92,14 @@ def draw_pinches(paths: list[Path], obj: str, engine: str, seed: int, file: Path
         with contextlib.suppress(EKMError):
             plant = SimulatedHand(load_hand(path), obj, engine=engine)
             held.append((path.stem, plant, plant.reset(seed).state))
-    figure, grid = plt.subplots(
-        -(-len(held) // 6), 6, figsize=(12, 2.1 * -(-len(held) // 6)), layout="constrained"
-    )
-    for axes in grid.flat:
+    rows = -(-len(held) // 6)
+    figure, grid = new_figure(12, 2.1 * rows, 6, rows)
+    for axes in grid:
         axes.set(aspect="equal")
         axes.set_axis_off()
     around = np.linspace(0, 2 * np.pi, 60)
     circle = np.array([np.cos(around), np.sin(around), np.zeros(60)])
-    for (name, plant, state), axes in zip(held, grid.flat, strict=False):
+    for (name, plant, state), axes in zip(held, grid, strict=False):
         across = np.linalg.svd(plant.rotation_axis.numpy()[None])[2][1:]
         poses = HandKinematics(plant.hand)(state.q)
         joints = [one for one in plant.hand.urdf.joints if {one.parent, one.child} <= {*poses.link_names}]

@@ -21,6 +21,7 @@ class Motors:
     """
 
     together = False
+    """Off with the last axis of a goal, on a bus that takes one after the other."""
 
     def __init__(self, start: Sequence[float], speed: float) -> None:
         self.speed = speed
@@ -72,7 +73,6 @@ class HandMotors:
     """
 
     together = True
-    """Off with the last axis: of a bus that takes one after the other."""
 
     def __init__(
         self,

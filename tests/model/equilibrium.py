@@ -18,7 +18,7 @@ from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.model.force_balance import ForceBalance, pack_forces
 from torch_ekm.model.grasp_forces import GraspForces
 from torch_ekm.model.kinematic_model import KinematicModel
-from torch_ekm.model.stiffness.potential import geometric_stiffness
+from torch_ekm.model.stiffness import geometric_stiffness
 from torch_ekm.typing import Float, Tensor
 
 

@@ -44,10 +44,8 @@ def felt(
         return None
     held = torch.zeros_like(was, dtype=torch.bool)
     held[hand.pad_rows(expected.pieces[0].linearization.contacts.finger)[1]] = True
-    touched, touches = (
-        held & (was >= NOISE.pressing),
-        now >= NOISE.pressing,
-    )  # one that reads less may be dead
+    # one that reads less may be dead
+    touched, touches = held & (was >= NOISE.pressing), now >= NOISE.pressing
     both, noise = touched & touches, (NOISE.force**2 + (_OF_IT * was).square()).sqrt()
     surprise = ((now - expected.normal).abs() > _WRONG * noise) & both
     return ForceChange((now - was).where(both, torch.nan), bool((surprise | (touched & ~touches)).any()))
@@ -77,10 +75,10 @@ class Lessons:
         Args:
             otherwise: what another explanation of the gaps leaves of them, rms [m]; the better one counts.
         """
-        model, force = self._controller.kinematic, seen.fingertip_force
-        if not self._figures.learns or force is None or not isinstance(model.detector, ContactDetector):
+        model = self._controller.kinematic
+        names = model.pressing(seen.fingertip_force)
+        if not (self._figures.learns and names and isinstance(model.detector, ContactDetector)):
             return
-        names = [pad.name for pad, f in zip(model.hand.pads, force, strict=True) if f > NOISE.pressing]
         found = model.detector(seen.q, seen.position, seen.rotation, names)
         gaps = [g for name, g in zip(found.finger, found.gap.tolist(), strict=True) if name in names]
         if len(gaps) > 1:

@@ -27,7 +27,7 @@ from .motion_equations import MotionEquations
 from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .options import ModelOptions
 from .reduction import Reduction, sensitivities
-from .stiffness.potential import (
+from .stiffness import (
     geometric_stiffness,
     gravity_gradient,
     gravity_hessian,
@@ -192,7 +192,7 @@ class KinematicModel(nn.Module):
         with torch.no_grad():
             if isinstance(detector, ContactDetector):
                 at = state.q if poses is None else poses
-                contacts = detector(at, *place, self._pressing(fingertip_force))
+                contacts = detector(at, *place, self.pressing(fingertip_force))
             else:
                 contacts = detector(state.q, *place)
         if contacts.n_c == 0:
@@ -201,7 +201,7 @@ class KinematicModel(nn.Module):
             return contacts
         return following(contacts, lambda at: self.contacts(at, fingertip_force), state)
 
-    def _pressing(self, fingertip_force: Tensor | None) -> tuple[str, ...]:
+    def pressing(self, fingertip_force: Tensor | None) -> tuple[str, ...]:
         """Pads that measure a force."""
         if fingertip_force is None or fingertip_force.shape != (len(self.hand.pads),):
             return ()
@@ -221,7 +221,7 @@ class KinematicModel(nn.Module):
         if not isinstance(detector, ContactDetector):
             return contacts
         margin = max(detector.margin, TOUCHING)
-        pressing = self._pressing(fingertip_force)
+        pressing = self.pressing(fingertip_force)
         near = detector.near(state.q, state.position, state.rotation, margin, pressing)
         pads = len(contacts.finger)  # they come first, in the same order
         links = [i for i in range(pads, near.n_c) if float(near.gap[i]) < TOUCHING]

@@ -18,6 +18,8 @@ from ...typing import Array
 from ..contact_kinematics import ContactModel
 from ..contact_set import CHARACTERISTIC_LENGTH
 
+Mask = NDArray[np.bool_]
+
 
 @dataclass(frozen=True)
 class ForceOptions:
@@ -119,9 +121,6 @@ def margins(cones: Sequence[FrictionCone], mu: Array) -> tuple[Array, Array]:
     limit = np.array([cone.mu_s * mu[cone.start] for cone in cones])
     relative = np.divide(slack, limit, out=np.zeros_like(slack), where=limit > 1e-12)
     return slack, relative
-
-
-Mask = NDArray[np.bool_]
 
 
 class ForceStatus(Enum):

@@ -30,6 +30,7 @@ class MotionTests:
     def __init__(self, readings: ReadingTests, model: KinematicModel) -> None:
         self.guards, self.readings, self.hand, self.model = readings.guards, readings, model.hand, model
         self._begun: Observation | None = None
+        self._moves = torch.from_numpy(self.hand.joint_upper > self.hand.joint_lower)
 
     def begin(self, seen: Observation) -> None:
         """The reading before the first motion."""
@@ -101,11 +102,9 @@ class MotionTests:
         """Distance of each pad that presses, or else is near, from the object [m], if all joints were off by
         an angle [rad]; infinite: far."""
         gaps: dict[str, float] = {}
-        moves = torch.from_numpy(self.hand.joint_upper > self.hand.joint_lower)
         with contextlib.suppress(GraspError):
-            near = self.model.detector(seen.q + offset * moves, seen.position, seen.rotation)
+            near = self.model.detector(seen.q + offset * self._moves, seen.position, seen.rotation)
             gaps = dict(zip(near.finger, near.gap.abs().tolist(), strict=True))
         if seen.fingertip_force is None:
             return gaps
-        pads = zip(self.hand.pads, seen.fingertip_force.tolist(), strict=True)
-        return {pad.name: gaps.get(pad.name, math.inf) for pad, force in pads if force > NOISE.pressing}
+        return {name: gaps.get(name, math.inf) for name in self.model.pressing(seen.fingertip_force)}

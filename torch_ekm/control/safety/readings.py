@@ -52,7 +52,7 @@ class ReadingTests:
         pose came before."""
         said = self._ages(seen, before)
         unseen = bool(said)  # the rest is still looked at
-        said += [*self.motors(before, sent, seen)]
+        said += self.motors(before, sent, seen)
         if expected is not None:
             ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
             said += self._jumps(ds, predicted, seen, unseen)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..._arrays import like, namespace
-from ...contact.contact_kinematics import ContactKinematics
-from ...kinematics.se3 import cross, hat
-from ...typing import AnyArray, Bool, Float, Tensor
+from .._arrays import like, namespace
+from ..contact.contact_kinematics import ContactKinematics
+from ..kinematics.se3 import cross, hat
+from ..typing import AnyArray, Bool, Float, Tensor
 
 
 def precedence(upstream: Bool[Tensor, "n_link n_q"]) -> Bool[Tensor, "n_q n_q"]:
