@@ -170,10 +170,12 @@ def minimise(
         gtol=1e-9,
     )
     start = np.clip(guess, low + 1e-9, high - 1e-9)
-    try:
-        found = squares(start)
-    except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
-        found = squares(0.999 * start + 0.0005 * (low + high))
+    # small matrices: on a busy machine threads that wait for each other take up to a hundred times as long
+    with require("threadpoolctl").threadpool_limits(1):
+        try:
+            found = squares(start)
+        except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
+            found = squares(0.999 * start + 0.0005 * (low + high))
     return found.x, float(found.cost)
 
 
