@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ekm.description import HandDescription, load_hand, write_template, write_transmission
+from torch_ekm.description import ContactPad, HandDescription, load_hand, write_template, write_transmission
 from torch_ekm.description.registry import file_digests
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
-from torch_ekm.inspection.check import check_hand
+from torch_ekm.inspection.check import _to_paste, check_hand
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.rendering.visuals import visuals
 
@@ -216,7 +216,7 @@ def test_a_template_is_filled_in_and_has_the_last_word(tmp_path: Path) -> None:
 
 def test_check_says_what_is_left_out(tmp_path: Path) -> None:
     rows = check_hand(str(written(tmp_path, FINGERS)), "no object")
-    assert sum(row.name == "assumed" and row.state == "warning" for row in rows) == 3
+    assert sum(row.name == "assumed" and row.state == "warning" for row in rows) == 4
     assert rows[-1].name == "object's files"
 
 
@@ -320,3 +320,17 @@ def test_elements_that_are_nested_too_deep_are_refused(tmp_path: Path) -> None:
     path.write_text("<mujoco><worldbody>" + "<body>" * 1200 + "</body>" * 1200 + "</worldbody></mujoco>")
     with pytest.raises(DescriptionError, match=r"deep\.xml.*nested too deep"):
         load_hand(path)
+
+
+def test_what_check_prints_of_a_pad_lies_there_in_the_mjcf(tmp_path: Path) -> None:
+    path, link = written(tmp_path, FINGERS), "first"  # which begins at its joints, not where the body does
+    pad = ContactPad("pad", link, (0.001, 0.002, 0.01), (0.001, 0.002, 0.02), 0.007)
+    pasted = _to_paste(load_hand(path), pad).partition(": ")[2]
+    assert pasted.startswith("<geom ")
+    path.write_text(path.read_text().replace('<geom name="first"', pasted + '<geom name="first"'))
+    shapes = load_hand(path).urdf.link(link).collisions
+    found = [shape for shape in shapes if shape.size == (0.007, 0.01)]
+    np.testing.assert_allclose(found[0].transform[:3, 3], [0.001, 0.002, 0.015], atol=1e-9)
+    assert "count from the joint, which is not where the body begins: first" in " ".join(
+        load_hand(path).notes
+    )

@@ -71,8 +71,8 @@ SPRING = "spring = 0.2, rest_deg = "
 FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and text of a row
     "pad away": (1, "[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]", "pad 'left'", "error", "away.*'left_1' closes"),
     "pad sideways": (1, "[0.0, -1.0, 0.0]", "[0.0, 0.0, 1.0]", "pad 'left'", "error", "no joint moves it"),
-    "pad off its link": (1, "radius = 0.006", "radius = 0.009", "pad 'left'", "warning", "not the <"),
-    "pad in a box": (0, _CAPSULE, _BOX, "pad 'left'", "warning", "a <collision> box, whose edges touch"),
+    "pad off its link": (1, "radius = 0.006", "radius = 0.009", "pad 'left'", "warning", "not the shape"),
+    "pad in a box": (0, _CAPSULE, _BOX, "pad 'left'", "warning", "in a box, whose edges touch"),
     "limits": (0, 'upper="1.5"', 'upper="0.02"', "limits", "error", "joint '.*_[01]': no posture within"),
     "no limits": (0, 'left_0" type="revolute"', 'left_0" type="continuous"', "limits", "error", "left_0"),
     "axis": (0, '<axis xyz="0 0 -1"/>', '<axis xyz="0 0.1 -1"/>', "hand's files", "error", "planar_normal"),
@@ -148,7 +148,7 @@ def test_where_the_files_have_a_fault_no_other_figure_is_tried(files, monkeypatc
     assert len(tried) == 1
     change(transmission, "radius = 0.006", "radius = 0.009")
     (row,) = [row for row in check_hand(str(urdf), "can") if row.name == "collision shapes"]
-    assert "paste the <collision> of pad 'left'" in row.remedy
+    assert "paste the shapes of pad 'left'" in row.remedy
     assert len(tried) == 1
     change(transmission, "radius = 0.009", "radius = 0.006")
     change(transmission, "[0.0, -1.0, 0.0]", "[0.0, 1.0, 0.0]")

@@ -111,7 +111,7 @@ def check(
         with console.status("Checking: some seconds, a minute or two where the pinch fails"):
             rows = check_hand(hand, object, picture)
     # a table breaks lines, and what is pasted must have none
-    parts = [row.remedy.partition(": <collision>") for row in rows]
+    parts = [row.remedy.partition(": <") for row in rows]
     shown = [row._replace(remedy=part[0]) for row, part in zip(rows, parts, strict=True)]
     print_table(Check._fields, shown, hand if plant is None else str(plant))
     for row, (where, shape, rest) in zip(rows, parts, strict=True):

@@ -164,8 +164,10 @@ class _Conversion:
         inertia = inertial[:3, :3] @ np.diag(model.body_inertia[body]) @ inertial[:3, :3].T
         geoms = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
         shapes = [shape for g in geoms if body and (shape := self._shape(name, g, at)) is not None]
-        mass = float(model.body_mass[body])
-        return UrdfLink(name, mass, inertial[:3, 3], inertia, tuple(shapes), name in self.meshes)
+        if at[:3, 3].any():
+            self._note("pads of these links count from the joint, which is not where the body begins", name)
+        mass, origin = float(model.body_mass[body]), tuple(at[:3, 3].tolist())
+        return UrdfLink(name, mass, inertial[:3, 3], inertia, tuple(shapes), name in self.meshes, origin)
 
     def _shape(self, link: str, geom: int, at: Array) -> Shape | None:
         model, kinds = self.model, self._mj.mjtGeom

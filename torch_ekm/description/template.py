@@ -57,8 +57,8 @@ _ACTUATORS = """
 """
 _PADS = """
 # The parts that touch objects, as capsules in the link's frame: all points within radius [m] of the segment
-# from start to end [m]. direction: outward, the middle of the side that touches. Pads that are simulated need
-# the same shape as <collision> in the URDF: a cylinder with a ball on either end, or a sphere.
+# from start to end [m]. direction: outward, the middle of the side that touches. For simulation their links
+# need the same shapes: in a URDF a cylinder with a ball on either end, in an MJCF a capsule; or a sphere.
 # A pinch in simulation is of the pad whose name begins with thumb, else of the one that faces the others
 # best; it presses against index* and middle*, where both are there, else against all others.
 """

@@ -71,6 +71,8 @@ class UrdfLink:
     collisions: tuple[Shape, ...]
     has_mesh: bool = False
     """Whether there are meshes, which ``collisions`` leaves out."""
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
+    """Where the frame of the MJCF's body begins, whose axes are the link's [m]."""
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     faulty = any(row.state == "error" for row in pinch)
     if faulty:
         if not unfit and (other := [row.name for row in pads if row.state != "ok"]):
-            remedy = f"first paste the <collision> of {', '.join(other)} as printed above"
+            remedy = f"first paste the shapes of {', '.join(other)} as printed above"
             found = "parts of the hand other than the pads touch the object"
             return [*rows, Check("collision shapes", "error", found, remedy), *pinch]
         if wrong := [row.name for row in pads if row.state == "error"]:
@@ -100,29 +100,35 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
         shapes, lack = hand.urdf.link(pad.link).collisions, direction_unmet(hand, pad)
         ends = np.array([pad.start, pad.end])
         depth = -signed_distance(shapes, ends)[0] if shapes else np.zeros(2)
-        name, remedy = f"pad '{pad.name}'", f"paste into <link name='{pad.link}'>: {_collision(pad)}"
+        name, remedy = f"pad '{pad.name}'", _to_paste(hand, pad)
         if lack is not None:
             yield Check(name, "error", f"{found}; {lack.problem}", lack.remedy)
         elif not shapes:
-            yield Check(name, "error", f"{found}; its link has no primitive <collision>", remedy)
+            yield Check(name, "error", f"{found}; its link has no primitive shape", remedy)
         elif any(shape.kind == "box" and (signed_distance((shape,), ends)[0] < 0).all() for shape in shapes):
-            yield Check(name, "warning", f"{found}; in a <collision> box, whose edges touch first", remedy)
+            yield Check(name, "warning", f"{found}; in a box, whose edges touch first", remedy)
         elif np.abs(depth - pad.radius).max() > _SURFACE:
-            yield Check(name, "warning", f"{found}; not the <collision> of its link", remedy)
+            yield Check(name, "warning", f"{found}; not the shape of its link", remedy)
         else:
             yield Check(name, "ok", found)
 
 
-def _collision(pad: ContactPad) -> str:
-    """The pad as a URDF has it: a ball, or a cylinder with a ball on either end."""
-    ends = np.array([pad.start, pad.end])
-    x, y, z = ends[1] - ends[0]
+def _to_paste(hand: HandDescription, pad: ContactPad) -> str:
+    """The pad as the hand's own file has it: in an MJCF a capsule, in a URDF a cylinder with a ball on either
+    end; or a ball."""
+    ends = np.unique([pad.start, pad.end], axis=0)
+    if hand.urdf_path.suffix != ".urdf":
+        at = " ".join(f"{x:.6g}" for x in (ends - hand.urdf.link(pad.link).origin).ravel())
+        kind = f'type="capsule" fromto="{at}"' if len(ends) > 1 else f'type="sphere" pos="{at}"'
+        return f'paste into <body name=\'{pad.link}\'>: <geom {kind} size="{pad.radius:g}" contype="1"/>'
+    x, y, z = ends[-1] - ends[0]
     rpy = f"0 {math.atan2(math.hypot(x, y), z):.6g} {math.atan2(y, x):.6g}"
     rod = f'<cylinder radius="{pad.radius:g}" length="{math.hypot(x, y, z):.6g}"/>'
-    parts = [(end, "0 0 0", f'<sphere radius="{pad.radius:g}"/>') for end in np.unique(ends, axis=0)]
+    parts = [(end, "0 0 0", f'<sphere radius="{pad.radius:g}"/>') for end in ends]
     parts += [(ends.mean(axis=0), rpy, rod)] if len(parts) > 1 else []
     form = '<collision><origin xyz="{:.6g} {:.6g} {:.6g}" rpy="{}"/><geometry>{}</geometry></collision>'
-    return "".join(form.format(*at, turned, body) for at, turned, body in parts)
+    shapes = "".join(form.format(*at, turned, body) for at, turned, body in parts)
+    return f"paste into <link name='{pad.link}'>: {shapes}"
 
 
 def _ranges(hand: HandDescription) -> Iterator[Check]:
