@@ -75,11 +75,6 @@ compare --data s.csv --targets a,y | at least one must be an input
 compare --data s.csv --limit -1 | --limit
 compare --data s.csv --limit 3 | too short
 compare --data s.csv --learners SOGP --out file.txt | cannot be written
-record file.txt | a log is a folder
-record log --object nothing | unknown object
-record log --controller bad | unknown controller
-record log --angles '' | numbers separated by commas
-record log --seeds -3:2 | 0 <= FIRST < END
 show nothing | unknown hand or log
 show file.txt | damaged, or not a recording
 show folder | no log
