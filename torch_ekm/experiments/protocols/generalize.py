@@ -161,8 +161,8 @@ def paper_table(trials: DataFrame) -> Table:
     for item, (km, ekm) in TABLE_II.items():
         by = tables.by_controller(both[both["object"] == item])
         if {"KM", "E-KM"} <= set(by):
-            ratio = stats.bootstrap_ratio(*stats.paired_means(by["E-KM"], by["KM"], "error_deg"))
             here = [stats.estimate(by[name], "error_deg") for name in ("KM", "E-KM")]
+            ratio = tables.ratio(both[both["object"] == item], "KM")
             rows.append([item, km, here[0], ekm, here[1], ekm / km, ratio])
     columns: list[Column | str] = [
         "object", Column("KM, paper [deg]", ".1f"), "KM, here [deg]", Column("E-KM, paper [deg]", ".1f"),
@@ -189,11 +189,11 @@ def significance_table(trials: DataFrame) -> Table:
         won = ekm[seeds] < km[seeds]
         lost = [f"{cell[0]}, trial {cell[1] + 1} ({n})" for cell, n in (~won).sum(axis=1).items() if n]
         until = np.median([stats.learning_curve(*hand).last_negative for hand in hands])
-        wins, units = won.sum(), tables.paired(chosen, "E-KM", "KM")
+        wins = won.sum()
         rows = [
             ["cells won", "24 of 25", f"{wins.median():g} of {len(won)}, least {wins.min()}"],
             ["cells lost (hands)", "can, trial 2", "; ".join(lost) or "none"],
-            *tables.p_rows(hands, *units, "3.8e-4"),
+            tables.p_row(hands, "3.8e-4"),
             ["turns until significant", None, f"{until:g}"],
         ]
     note = (

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from ..._extras import require
 from ..._files import make_folder, told_as_output_error
 from ..._versions import versions_of
-from .statistics import Estimate, Rate
+from .statistics import Estimate
 
 _PACKAGES = (
     "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "pytorch-kinematics",
@@ -24,7 +24,7 @@ _PACKAGES = (
 _FIGURE = re.compile(r"[-+]?\d[\d.e+-]*(?: \[[^\]]*\]| (?=%|deg\b|mm\b))(?: ?(?:%|deg\b|mm\b))?")
 T = TypeVar("T")
 #: None: there is nothing to say.
-Cell = str | bool | int | float | Estimate | Rate | None
+Cell = str | bool | int | float | Estimate | None
 
 
 @dataclass(frozen=True)
