@@ -126,8 +126,8 @@ def reason_table(trials: DataFrame) -> Table:
 
 def ratio(trials: DataFrame, theirs: str) -> Estimate | None:
     """Mean error of the E-KM over that of another controller, on the units that both have."""
-    both = (select(trials, controller=name, kind="turn") for name in ("E-KM", theirs))
-    ours, others = stats.paired_means(*both, "error_deg")
+    mine, other = (select(trials, controller=name, kind="turn") for name in ("E-KM", theirs))
+    ours, others = stats.paired_means(mine, other, "error_deg")
     return stats.bootstrap_ratio(ours, others) if len(ours) and others.mean() else None
 
 
