@@ -7,7 +7,6 @@ from typing import Any
 
 from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, READINGS, WHOLE_TURNS, Contender
 from matrix import Frame, Question, bands_table, learning_picture, table
-from sensing import hall_table
 from sessions import TARGETS, directions, foresight, there_and_back, turns
 
 from torch_ekm.experiments.config import Setting
@@ -92,7 +91,7 @@ _ASKED = (
     ),
     Question(
         "sensing", "What each reading is worth", turns, READINGS, setting=_SEEN.replace(engine="mujoco"),
-        options=BY_HAND, split="object", more=(hall_table,),
+        options=BY_HAND, split="object",
         columns=(
             "turns", "lost", "reached", "error [deg]", "by the E-KM [deg]", "joints off by [deg]",
             "motors off by [deg]",

@@ -381,7 +381,7 @@ def test_command_prints_and_writes_what_the_function_returns(tmp_path: Path) -> 
     arguments = ["compare", "--data", str(path), "--learners", "linear RLS,SOGP plain", "--out", str(out)]
     result = CliRunner().invoke(app, [*arguments, "--jobs", "1"])
     assert result.exit_code == 0, result.output
-    for name in ("index.html", "scores.svg", "scores_mine.csv", "curve_mine.png", "configuration.json"):
+    for name in ("index.html", "scores.svg", "scores_mine.csv", "curve_mine.svg", "configuration.json"):
         assert (out / name).stat().st_size > 100, name
     direct = compare(path, ("linear RLS", "SOGP plain"))
     written = (out / "scores_mine.csv").read_text().splitlines()[1:]

@@ -29,7 +29,7 @@ class ComparisonReport(Comparison):
         return "\n".join([str(self.tables()[0]), *self.verdicts()])
 
     def write(self, folder: str | Path) -> Report:
-        """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
+        """Tables as CSV, figures as SVG, and ``index.html`` with all of them, into ``folder``."""
         save = partial(save_figure, folder=Path(folder))
         caption = (
             "Error over that of the model alone with 95 % intervals, left of 1 a learner helps. Blue: "
