@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -48,7 +48,7 @@ class Question(Protocol):
 
     name: str
     title: str
-    act: Callable[..., list[TrialRecord]]
+    act: Callable[..., Iterable[TrialRecord]]
     """What is done with one hand, controller and seed: ``act(make, items, seed, **options)``."""
     contenders: Mapping[str, Contender]
     hands: Sequence[str] = ("nominal",)
@@ -72,6 +72,8 @@ class Question(Protocol):
     """Further tables."""
     picture: Callable[[Frame], Figure] | None = None
     """None: ends and motions of the groups of ``split``."""
+    told: Callable[[Frame], str] | None = None
+    """The last line; None: :func:`verdict`."""
     short: Mapping[str, Any] = field(default_factory=lambda: {"angles": (4.0,), "learns_by": ()})
     """Options that make a session short."""
 
@@ -132,7 +134,11 @@ class Question(Protocol):
             tables.append(pivot(turns, self.by, self.split))
         drawn = ends_picture(turns, self.by, self.split) if self.picture is None else self.picture(turns)
         figure = save_figure(drawn, folder, self.name, f"{self.title}: each group of turns.")
-        return Report(self.title, f"{verdict(turns, self.by)}.", tables, [figure])
+        return Report(self.title, f"{self.answer(turns)}.", tables, [figure])
+
+    def answer(self, turns: Frame) -> str:
+        """What came of each group."""
+        return verdict(turns, self.by) if self.told is None else self.told(turns)
 
 
 @dataclass(frozen=True)
@@ -345,7 +351,7 @@ def ask(asked: Question, arguments: Sequence[str] | None = None, about: str | No
         trials = run_trials(planned, given.out, given.jobs, advance)
     made = write_report(planned, trials, given.out)
     print_report(made, given.out, every=True)
-    print(verdict(asked.counted(trials), asked.by))
+    print(asked.answer(asked.counted(trials)))
     return made
 
 

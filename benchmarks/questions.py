@@ -8,6 +8,7 @@ from typing import Any
 from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, READINGS, WHOLE_TURNS, Contender
 from matrix import Frame, Question, bands_table, learning_picture, table
 from sessions import TARGETS, directions, foresight, there_and_back, turns
+from slides import errors_picture, errors_table, slides, told
 
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.generalize import ENDS, TABLE_I, paper_table, significance_table
@@ -125,6 +126,12 @@ _ASKED = (
             "estimate off by [deg]", "stated sd [deg]",
         ),
         split="object", short={"learns_by": (), "far": 6.0, "blind": 5.0},
+    ),
+    Question(
+        "slides", "Contacts that slide, open and close", slides, {"KM": Contender("KM")},
+        hands=("described",), options={"motions": 25}, by="plant", columns=(), more=(errors_table,),
+        objects=("box", "can", "bottle", "applier", "flashlight", "jar", "tea_tin", "carton"),
+        picture=errors_picture, told=told, short={"motions": 3},
     ),
 )  # fmt: skip
 QUESTIONS = {asked.name: asked for asked in _ASKED}

@@ -167,7 +167,7 @@ def test_movements_of_a_loop_without_watch_go_to_their_end(tmp_path: Path, monke
         assert bool(asked) == watched
 
 
-@pytest.mark.parametrize("name", ["generalize", "series", "directions", "printed", "new_object"])
+@pytest.mark.parametrize("name", ["generalize", "series", "directions", "printed", "new_object", "slides"])
 def test_every_kind_of_session_runs(name: str, tmp_path: Path) -> None:
     asked = QUESTIONS[name]
     made = matrix.ask(asked, ["--quick", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)])
