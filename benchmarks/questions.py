@@ -13,7 +13,7 @@ from slides import errors_picture, errors_table, slides, told
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.generalize import ENDS, TABLE_I, paper_table, significance_table
 from torch_ekm.experiments.reporting.report import Table
-from torch_ekm.experiments.reporting.tables import controller_table, prediction_table, reason_table
+from torch_ekm.experiments.reporting.tables import controller_table, reason_table
 from torch_ekm.experiments.runner import new_objects
 
 _ANGLES = (9.0, 19.0, 27.0)  # [deg] from fresh grasps
@@ -55,7 +55,7 @@ _ASKED = (
     Question(
         "generalize", "Every object by shares of its workspace, every controller", turns, PLAIN,
         objects=(*TABLE_I, *ENDS), setting=_SEEN, options=_TO_THE_END, columns=(), split="object",
-        more=(controller_table, prediction_table, reason_table, paper_table, significance_table),
+        more=(controller_table, reason_table, paper_table, significance_table),
     ),
     Question(
         "hands", "Hands of other kinds", turns, {name: PLAIN[name] for name in ("E-KM", "KM+S", "KM+I")},

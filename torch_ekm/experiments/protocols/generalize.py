@@ -129,14 +129,12 @@ class Generalize(Protocol):
             caption = "Steady-state error with each object for each target: every turn, and the mean (the "
             caption += "paper's Fig. 6). Crosses at the upper edge: errors above."
             figures = [save_figure(plot_steady_state_error(turns), folder, "steady_state_error", caption)]
-        significance = significance_table(trials)
         shown = [
             paper_table(trials),
-            significance,
+            significance_table(trials),
             tables.reason_table(trials),
             tables.group_table(trials, "object", "each object"),
             tables.controller_table(trials),
-            tables.prediction_table(trials),
         ]
         shown = [table for table in shown if table.rows]
         names = ", ".join(object_name(item) for item in self.objects)
@@ -145,10 +143,6 @@ class Generalize(Protocol):
             summary += (
                 f" Turns of the E-KM with each object and seed before those that count: {self.warm_up}."
             )
-        if significance.rows and len(self.objects) > 1:
-            won, *_, until = (row[-1] for row in significance.rows)
-            summary += f" On one hand the E-KM ends nearer in {won} cells of object and target;"
-            summary += f" that is significant after turn {until} (medians over hands)."
         leading, legend = int(shown[0].name == "paper"), tables.legend(trials)
         title = "Generalisation: other objects, other weights"
         return Report(title, summary, shown, figures, leading=leading, legend=legend)

@@ -104,7 +104,6 @@ class Online(Protocol):
         shown = [
             self.paper_table(trials),
             tables.reason_table(trials),
-            tables.prediction_table(trials),
             tables.controller_table(trials),
         ]
         what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."

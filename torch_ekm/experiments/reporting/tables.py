@@ -25,30 +25,12 @@ LEGEND = {
     "E-KM": "the same servo inverse; the model follows the figures of the hand, which it learns, and a "
     "learner corrects it; it plans whole turns, and goes as far at once as it is sure",
 }
-_MEANINGS = {
-    StopReason.REACHED.value: "the measured error stays within the tolerance",
-    StopReason.STALLED.value: "the error falls no further",
-    StopReason.STEP_LIMIT.value: "all motions are used up",
-    StopReason.ACTUATOR_LIMITS.value: "the motors that are needed are at the ends of their ranges",
-    StopReason.UNSTABLE_GRASP.value: "the model predicts that the grasp buckles, or cannot be held",
-    StopReason.GIVEN_UP.value: "no way on was safe; the object is in the hand",
-    StopReason.WEAK_GRASP.value: "declined: a finger bore less than the object needs",
-    StopReason.OUT_OF_REACH.value: "declined before anything moved",
-    StopReason.OBJECT_LOST.value: "the object was dropped, or turned too far off the axis",
-    StopReason.FORCE_CEILING.value: "a fingertip pressed harder than the guard allows",
-    NOT_GRASPED: "no pinch held the object",
-}
 
 
 def by_controller(trials: DataFrame) -> dict[str, DataFrame]:
     """The turns of each controller that has any."""
     found = {name: select(trials, controller=name, kind="turn") for name in CONTROLLERS}
     return {name: mine for name, mine in found.items() if len(mine)}
-
-
-def by_object(trials: DataFrame) -> dict[str, DataFrame]:
-    """Trials of each object, and of all."""
-    return {str(name): mine for name, mine in trials.groupby("object", sort=False)} | {"all": trials}
 
 
 def legend(trials: DataFrame) -> dict[str, str]:
@@ -64,14 +46,15 @@ def controller_table(trials: DataFrame) -> Table:
         Column("motions", ".1f"): lambda mine: stats.estimate(mine, "motions"),
         Column("first motion [deg]"): lambda mine: stats.estimate(mine, "first_step_deg"),
         Column("reached"): lambda mine: stats.rate(mine["reason"] == _REACHED),
-        Column("not reached"): lambda mine: stats.rate(mine["not_reached"]),
         Column("lost"): lambda mine: stats.rate(mine["lost"]),
+        Column("KM, one motion [deg]"): lambda mine: stats.estimate(mine, "prediction_km"),
+        Column("E-KM, one motion [deg]"): lambda mine: stats.estimate(mine, "prediction_ekm"),
     }
     note = (
         "Mean and 95 % bootstrap interval over pairs of object and seed; steady-state errors by the "
         "simulation's truth. A lost object counts with the whole angle of the target. First motion: by how "
-        "much more or less it changed the error than it was to. Not reached: the object is in the hand, but "
-        "not at its target. Intervals of rates are Wilson's."
+        "much more or less it changed the error than it was to. Intervals of rates are Wilson's. One motion: "
+        "how far KM and E-KM mispredict what was measured of a motion, before the learner trains on it."
     )
     items = by_controller(trials)
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
@@ -118,8 +101,8 @@ def reason_table(trials: DataFrame) -> Table:
         count, mean = mine.size(), mine.mean()
         errors = {name: "" if np.isnan(mean[name]) else f" ({mean[name]:.2f})" for name in count.index}
         cells = [f"{count[name]}{errors[name]}" if name in errors else "-" for name in names]
-        rows.append([reason, *cells, _MEANINGS.get(reason, "a guard stopped it")])
-    columns = ["reason", *(f"{name}: turns (error [deg])" for name in names), "what it means"]
+        rows.append([reason, *cells])
+    columns = ["reason", *(f"{name}: turns (error [deg])" for name in names)]
     note = "Turns, and in brackets the mean true error at their end; none of lost objects."
     return Table("stop_reasons", "Why the turns ended", columns, rows, note)
 
@@ -135,42 +118,6 @@ def p_row(hands: Sequence[tuple[Array, Array]], paper: str) -> list[Cell]:
     """p of the paper's two-sided test of two samples on each hand alone: the median."""
     each = [require("scipy.stats").ttest_ind(*hand).pvalue for hand in hands if len(hand[0]) > 1]
     return ["p of two samples, one hand (median)", paper, f"{np.median(each):.1e}" if each else None]
-
-
-def prediction_means(trials: DataFrame, kind: str = "") -> tuple[Array, Array]:
-    """Unit means of the one-step prediction errors of E-KM and KM on the E-KM's own motions [deg].
-
-    Args:
-        kind: "true_" for errors against the plant's truth.
-    """
-    mine = select(trials, controller="E-KM", kind="turn").dropna(subset="prediction_ekm")
-    return stats.paired_means(mine, mine, f"{kind}prediction_ekm", f"{kind}prediction_km")
-
-
-def prediction_cells(trials: DataFrame, kind: str = "") -> list[Cell]:
-    """KM, E-KM, and their ratio; nothing where no E-KM moved."""
-    ours, theirs = prediction_means(trials, kind)
-    if not len(ours):
-        return [None] * 3
-    return [stats.bootstrap_mean(theirs), stats.bootstrap_mean(ours), stats.bootstrap_ratio(ours, theirs)]
-
-
-def prediction_table(trials: DataFrame) -> Table:
-    """One-step prediction error of KM and E-KM on the E-KM's own motions."""
-    rows = [
-        [name, *prediction_cells(mine), *prediction_cells(mine, "true_")]
-        for name, mine in by_object(trials).items()
-        if len(prediction_means(mine)[0])
-    ]
-    columns: list[Column | str] = ["object"]
-    for what in ("measured", "true"):
-        ratio = Column(f"E-KM:KM, {what} [%]", ".0f", percent=True)
-        columns += [f"KM, {what} [deg]", f"E-KM, {what} [deg]", ratio]
-    note = (
-        "Mean |M_c (ds - prediction)| [deg], the prediction made before the learner trains on the motion. "
-        "'Measured' includes the camera's noise, which no model can predict; 'true' does not."
-    )
-    return Table("prediction", "One-step prediction error", columns, rows, note)
 
 
 def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
@@ -189,10 +136,11 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
         parts.append(f"Objects lost, and turns that did not reach the target: {', '.join(failed)}.")
         if 2 * (turns[order[0]]["reason"] == _REACHED).sum() < len(turns[order[0]]):
             parts.append(f"The {order[0]}: {why(turns[order[0]])}")
-    ours, theirs = prediction_means(trials)
-    if len(ours):
-        wrong = f"{stats.bootstrap_mean(ours):.2f} deg, the KM to {stats.bootstrap_mean(theirs):.2f} deg"
-        parts.append(f"The E-KM predicts one motion to {wrong} on the same motions.")
+    ours, theirs = (
+        stats.estimate(turns.get("E-KM", trials[:0]), f"prediction_{name}") for name in ("ekm", "km")
+    )
+    if ours is not None:
+        parts.append(f"The E-KM predicts one motion to {ours:.2f} deg, the KM to {theirs:.2f} deg.")
     if len(seeds) >= LEAST_SEEDS and order[:1] == ["E-KM"]:
         found = {name: ratio(trials, name) for name in order[1:]}
         ratios = [f"{name} {100 * one:.0f} %" for name, one in found.items() if one is not None]
