@@ -29,6 +29,7 @@ from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.reporting.tables import pivot
 from torch_ekm.experiments.reporting.trials import select
 from torch_ekm.experiments.reproduce import Experiment, run_trials, write_report
 from torch_ekm.simulation import ENGINES
@@ -131,7 +132,7 @@ class Question(Protocol):
         tables = [table(turns, self.by, self.columns, self.name, self.title)] if self.columns else []
         tables += [one for make in self.more if (one := make(select(trials))).rows]
         if turns[self.split].nunique() > 1 and self.split != self.by:
-            tables.append(pivot(turns, self.by, self.split))
+            tables.append(ends_table(turns, self.by, self.split))
         drawn = ends_picture(turns, self.by, self.split) if self.picture is None else self.picture(turns)
         figure = save_figure(drawn, folder, self.name, f"{self.title}: each group of turns.")
         return Report(self.title, f"{self.answer(turns)}.", tables, [figure])
@@ -224,21 +225,14 @@ def table(turns: Frame, by: str, columns: Sequence[str], name: str, title: str, 
     return Table.of(name, title, by, items, cells, note)
 
 
-def pivot(turns: Frame, by: str, split: str) -> Table:
+def ends_table(turns: Frame, by: str, split: str) -> Table:
     """Lost, reached, motions: a row for each entry of ``split``, a column for each of ``by``."""
-    names = list(dict.fromkeys(turns[by]))
-    rows: list[list[Cell]] = []
-    for key, mine in turns.groupby(split, sort=False):
-        groups = dict(tuple(mine.groupby(by)))
-        cells = (
-            f"{int(one['lost'].sum())}, {len(_reached(one))}, {_mean(_reached(one)['motions']):.1f}"
-            if (one := groups.get(name)) is not None
-            else "-"
-            for name in names
-        )
-        rows.append([str(key), len(mine), *cells])
+
+    def cell(mine: Frame) -> str:
+        return f"{int(mine['lost'].sum())}, {len(_reached(mine))}, {_mean(_reached(mine)['motions']):.1f}"
+
     note = "Lost, reached, and mean motions of the turns that reached the target."
-    return Table(f"by_{split}", f"Each {split}", [split, "turns", *names], rows, note)
+    return pivot(turns, by, split, cell, note)
 
 
 def ends_picture(turns: Frame, by: str, split: str) -> Figure:

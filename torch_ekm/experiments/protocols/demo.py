@@ -19,7 +19,7 @@ from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, FigureFile, Report, Table
 from ..reporting.statistics import DataFrame
-from ..reporting.tables import group_table
+from ..reporting.tables import error_table
 from ..reporting.trials import select
 from ..runner import Bench, new_objects
 from .generalize import Generalize
@@ -73,8 +73,7 @@ class Demo(Generalize):
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
         shown = ("stop_reasons", "controllers")
-        by_angle = group_table(turns, "angle_deg", "each target")
-        leading = [by_angle, *([new_table(trials)] if self.new else [])]
+        leading = [error_table(turns, "angle_deg"), *([new_table(trials)] if self.new else [])]
         report.tables = leading + [table for table in report.tables if table.name in shown]
         report.leading = len(leading)
         report.figures = [*self._pictures(turns, folder), *self._motions(turns, folder), *report.figures]

@@ -133,7 +133,7 @@ class Generalize(Protocol):
             paper_table(trials),
             significance_table(trials),
             tables.reason_table(trials),
-            tables.group_table(trials, "object", "each object"),
+            tables.error_table(trials, "object"),
             tables.controller_table(trials),
         ]
         shown = [table for table in shown if table.rows]
@@ -182,17 +182,14 @@ def significance_table(trials: DataFrame) -> Table:
         hands = [(ekm[seed].to_numpy(), km[seed].to_numpy()) for seed in seeds]
         won = ekm[seeds] < km[seeds]
         lost = [f"{cell[0]}, trial {cell[1] + 1} ({n})" for cell, n in (~won).sum(axis=1).items() if n]
-        until = np.median([stats.learning_curve(*hand).last_negative for hand in hands])
         wins = won.sum()
         rows = [
             ["cells won", "24 of 25", f"{wins.median():g} of {len(won)}, least {wins.min()}"],
             ["cells lost (hands)", "can, trial 2", "; ".join(lost) or "none"],
             tables.p_row(hands, "3.8e-4"),
-            ["turns until significant", None, f"{until:g}"],
         ]
     note = (
         "A cell is an object with a target; the E-KM wins it where it ends nearer than the KM. As in the "
-        "paper one hand turns each cell once: medians over hands. Until significant: the last k for which "
-        "the first k cells, object by object, show no advantage at 5 %."
+        "paper one hand turns each cell once: medians over hands."
     )
     return Table("significance", "Cells won, and p-values", ["figure", "paper", "here"], rows, note)

@@ -60,33 +60,29 @@ def controller_table(trials: DataFrame) -> Table:
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
 
 
-def group_table(trials: DataFrame, by: str, what: str) -> Table:
-    """Steady-state errors and ends of the turns by the entries of a column, the E-KM's paired with the KM's.
-
-    Args:
-        by: "object" (the paper's Table II), "angle_deg".
-        what: the groups in words.
-    """
-    names, rows = list(by_controller(trials)), []
-    turns = trials[trials["kind"] == "turn"]
+def pivot(turns: DataFrame, by: str, split: str, cell: Callable[[DataFrame], Cell], note: str) -> Table:
+    """A row for each entry of the column ``split`` and one for all, a column for each of ``by``."""
+    names, rows = list(dict.fromkeys(turns[by])), []
     groups = {
         f"{key:g}" if isinstance(key, float) else str(key): mine
-        for key, mine in turns.groupby(by, sort=False)
+        for key, mine in turns.groupby(split, sort=False)
     }
     for key, mine in {**groups, "all": turns}.items():
-        found = by_controller(mine)
-        errors = [stats.estimate(found[name], "error_deg") if name in found else None for name in names]
-        ends = (f"{name} {of['lost'].sum()}, {of['not_reached'].sum()}" for name, of in found.items())
-        rows.append([key, *errors, ratio(mine, "KM"), "; ".join(ends)])
-    columns = [
-        by.replace("_deg", " [deg]"), *(f"{name} [deg]" for name in names),
-        Column("E-KM:KM [%]", ".0f", percent=True), "lost, not reached",
-    ]  # fmt: skip
-    note = (
-        "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
-        "pairs of object and seed."
-    )
-    return Table(f"by_{by.removesuffix('_deg')}", f"Steady-state error of {what}", columns, rows, note)
+        found = dict(tuple(mine.groupby(by)))
+        rows.append([key, len(mine), *(cell(found[name]) if name in found else None for name in names)])
+    what = split.removesuffix("_deg")
+    return Table(f"by_{what}", f"Each {what}", [split.replace("_deg", " [deg]"), "turns", *names], rows, note)
+
+
+def error_table(trials: DataFrame, split: str) -> Table:
+    """Steady-state errors and ends of the turns by the entries of a column, such as "object"."""
+
+    def cell(turns: DataFrame) -> str:
+        error = stats.estimate(turns, "error_deg")
+        return f"{error:.2f}; {turns['lost'].sum()}, {turns['not_reached'].sum()}"
+
+    note = "Steady-state error [deg], lost objects with the whole angle; turns lost, and not reached."
+    return pivot(select(trials, kind="turn"), "controller", split, cell, note)
 
 
 def reason_table(trials: DataFrame) -> Table:
