@@ -58,9 +58,7 @@ def reproduce(
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
     engine: Engine = "sapien",
-    learner: Annotated[
-        str, Option(help="action-linear, rbf, SOGP deep, ...; an unknown name lists all.")
-    ] = "action-linear",
+    learner: Annotated[str, Option(help="action-linear, rbf, or model alone.")] = "action-linear",
     sensing: Sensing = True,
     angles: Annotated[str, Option(help="Turns [deg], e.g. 5,10; else shares of each end (generalize).")] = "",
 ) -> None:
@@ -96,7 +94,7 @@ def compare(
         str,
         Option(
             help="Names, separated by commas: default, SOGP, linear RLS, model alone, ...; an "
-            "unknown name lists all. If left out: all but rbf, action-linear and those of other libraries."
+            "unknown name lists all. If left out: all but those of other libraries."
         ),
     ] = "",
     targets: Annotated[str, Option("--targets", "--measured", help="To predict; else y, y1, ...")] = "",
