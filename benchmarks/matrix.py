@@ -231,8 +231,7 @@ def ends_table(turns: Frame, by: str, split: str) -> Table:
     def cell(mine: Frame) -> str:
         return f"{int(mine['lost'].sum())}, {len(_reached(mine))}, {_mean(_reached(mine)['motions']):.1f}"
 
-    note = "Lost, reached, and mean motions of the turns that reached the target."
-    return pivot(turns, by, split, cell, note)
+    return pivot(turns, by, split, cell, "lost, reached, and motions of those that reached the target")
 
 
 def ends_picture(turns: Frame, by: str, split: str) -> Figure:

@@ -56,9 +56,9 @@ reproduce online --angles 5 | 'online' does not take it
 reproduce generalize --objects nothing | unknown object
 reproduce generalize --objects , | at least one object
 reproduce generalize --angles x | numbers separated by commas
-reproduce generalize --angles 0 | more than 0 and less than 180 deg
-reproduce generalize --angles nan | more than 0 and less than 180 deg
-reproduce generalize --angles 400 | more than 0 and less than 180 deg
+reproduce generalize --angles 0 | angles between 0 and 180 deg
+reproduce generalize --angles nan | angles between 0 and 180 deg
+reproduce generalize --angles 400 | angles between 0 and 180 deg
 reproduce generalize --preset bad | unknown preset
 reproduce generalize --learner bad | unknown learner
 compare | Missing option '--data'

@@ -60,7 +60,7 @@ def controller_table(trials: DataFrame) -> Table:
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
 
 
-def pivot(turns: DataFrame, by: str, split: str, cell: Callable[[DataFrame], Cell], note: str) -> Table:
+def pivot(turns: DataFrame, by: str, split: str, cell: Callable[[DataFrame], Cell], what: str) -> Table:
     """A row for each entry of the column ``split`` and one for all, a column for each of ``by``."""
     names, rows = list(dict.fromkeys(turns[by])), []
     groups = {
@@ -70,8 +70,8 @@ def pivot(turns: DataFrame, by: str, split: str, cell: Callable[[DataFrame], Cel
     for key, mine in {**groups, "all": turns}.items():
         found = dict(tuple(mine.groupby(by)))
         rows.append([key, len(mine), *(cell(found[name]) if name in found else None for name in names)])
-    what = split.removesuffix("_deg")
-    return Table(f"by_{what}", f"Each {what}", [split.replace("_deg", " [deg]"), "turns", *names], rows, note)
+    name, columns = split.removesuffix("_deg"), [split.replace("_deg", " [deg]"), "turns", *names]
+    return Table(f"by_{name}", f"Each {name}: {what}", columns, rows)
 
 
 def error_table(trials: DataFrame, split: str) -> Table:
@@ -81,8 +81,8 @@ def error_table(trials: DataFrame, split: str) -> Table:
         error = stats.estimate(turns, "error_deg")
         return f"{error:.2f}; {turns['lost'].sum()}, {turns['not_reached'].sum()}"
 
-    note = "Steady-state error [deg], lost objects with the whole angle; turns lost, and not reached."
-    return pivot(select(trials, kind="turn"), "controller", split, cell, note)
+    what = "steady-state error [deg], lost objects with the whole angle; turns lost, and not reached"
+    return pivot(select(trials, kind="turn"), "controller", split, cell, what)
 
 
 def reason_table(trials: DataFrame) -> Table:
