@@ -72,6 +72,10 @@ CONDITIONS: dict[str, Hand] = {
     "left hand": {"hand": "icub_left"},
     "centred grasps": {"config": PlantConfig(spread=0.0)},
 }  # fmt: skip
+#: Without faults and noise.
+DESCRIBED: dict[str, Hand] = {
+    f"described in {label}": _hand(preset("none"), engine=engine) for engine, label in ENGINES.items()
+}
 #: Presets in both engines.
 IN_ENGINES: dict[str, Hand] = {
     f"{name} in {label}": {**OTHERS[name], "engine": engine}
@@ -86,13 +90,14 @@ def hands(names: Sequence[str]) -> dict[str, Hand]:
     Raises:
         SystemExit: no such hand; the message lists them.
     """
-    known = {**OTHERS, **LOSING, **CONDITIONS, **IN_ENGINES}
+    known = {**OTHERS, **LOSING, **CONDITIONS, **IN_ENGINES, **DESCRIBED}
     groups = {
         "all": [*FAMILIES, *OTHERS],
         "strong": [*(f"{name}:strong" for name in FAMILIES), *OTHERS],
         "losing": [*LOSING],
         "conditions": [*CONDITIONS],
         "engines": [*IN_ENGINES],
+        "described": [*DESCRIBED],
     }
     found: dict[str, Hand] = {}
     for name in itertools.chain.from_iterable(groups.get(name, [name]) for name in names):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -29,6 +29,7 @@ from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.reporting.tables import pivot
 from torch_ekm.experiments.reporting.trials import select
 from torch_ekm.experiments.reproduce import Experiment, run_trials, write_report
 from torch_ekm.simulation import ENGINES
@@ -48,7 +49,7 @@ class Question(Protocol):
 
     name: str
     title: str
-    act: Callable[..., list[TrialRecord]]
+    act: Callable[..., Iterable[TrialRecord]]
     """What is done with one hand, controller and seed: ``act(make, items, seed, **options)``."""
     contenders: Mapping[str, Contender]
     hands: Sequence[str] = ("nominal",)
@@ -72,6 +73,8 @@ class Question(Protocol):
     """Further tables."""
     picture: Callable[[Frame], Figure] | None = None
     """None: ends and motions of the groups of ``split``."""
+    told: Callable[[Frame], str] | None = None
+    """The last line; None: :func:`verdict`."""
     short: Mapping[str, Any] = field(default_factory=lambda: {"angles": (4.0,), "learns_by": ()})
     """Options that make a session short."""
 
@@ -129,10 +132,14 @@ class Question(Protocol):
         tables = [table(turns, self.by, self.columns, self.name, self.title)] if self.columns else []
         tables += [one for make in self.more if (one := make(select(trials))).rows]
         if turns[self.split].nunique() > 1 and self.split != self.by:
-            tables.append(pivot(turns, self.by, self.split))
+            tables.append(ends_table(turns, self.by, self.split))
         drawn = ends_picture(turns, self.by, self.split) if self.picture is None else self.picture(turns)
         figure = save_figure(drawn, folder, self.name, f"{self.title}: each group of turns.")
-        return Report(self.title, f"{verdict(turns, self.by)}.", tables, [figure])
+        return Report(self.title, f"{self.answer(turns)}.", tables, [figure])
+
+    def answer(self, turns: Frame) -> str:
+        """What came of each group."""
+        return verdict(turns, self.by) if self.told is None else self.told(turns)
 
 
 @dataclass(frozen=True)
@@ -218,21 +225,13 @@ def table(turns: Frame, by: str, columns: Sequence[str], name: str, title: str, 
     return Table.of(name, title, by, items, cells, note)
 
 
-def pivot(turns: Frame, by: str, split: str) -> Table:
+def ends_table(turns: Frame, by: str, split: str) -> Table:
     """Lost, reached, motions: a row for each entry of ``split``, a column for each of ``by``."""
-    names = list(dict.fromkeys(turns[by]))
-    rows: list[list[Cell]] = []
-    for key, mine in turns.groupby(split, sort=False):
-        groups = dict(tuple(mine.groupby(by)))
-        cells = (
-            f"{int(one['lost'].sum())}, {len(_reached(one))}, {_mean(_reached(one)['motions']):.1f}"
-            if (one := groups.get(name)) is not None
-            else "-"
-            for name in names
-        )
-        rows.append([str(key), len(mine), *cells])
-    note = "Lost, reached, and mean motions of the turns that reached the target."
-    return Table(f"by_{split}", f"Each {split}", [split, "turns", *names], rows, note)
+
+    def cell(mine: Frame) -> str:
+        return f"{int(mine['lost'].sum())}, {len(_reached(mine))}, {_mean(_reached(mine)['motions']):.1f}"
+
+    return pivot(turns, by, split, cell, "lost, reached, and motions of those that reached the target")
 
 
 def ends_picture(turns: Frame, by: str, split: str) -> Figure:
@@ -345,7 +344,7 @@ def ask(asked: Question, arguments: Sequence[str] | None = None, about: str | No
         trials = run_trials(planned, given.out, given.jobs, advance)
     made = write_report(planned, trials, given.out)
     print_report(made, given.out, every=True)
-    print(verdict(asked.counted(trials), asked.by))
+    print(asked.answer(asked.counted(trials)))
     return made
 
 

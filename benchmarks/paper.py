@@ -25,8 +25,8 @@ from torch_ekm.experiments.protocols.online import Online, prediction_curves
 from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Report, Table
-from torch_ekm.experiments.reporting.statistics import DataFrame, bootstrap_mean
-from torch_ekm.experiments.reporting.tables import prediction_means
+from torch_ekm.experiments.reporting.statistics import DataFrame, estimate
+from torch_ekm.experiments.reporting.trials import select
 from torch_ekm.experiments.reproduce import Experiment, run_trials
 
 #: The last row of Table II as it is printed: E-KM:KM [%].
@@ -141,7 +141,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for name, one in protocols.items()
         }
     trials = found.pop("online")
-    ekm, km = (bootstrap_mean(errors) for errors in prediction_means(trials))
+    turns = select(trials, controller="E-KM", kind="turn")
+    ekm, km = (estimate(turns, f"prediction_{name}") for name in ("ekm", "km"))
     table = figures_table(found, online.paper_table(trials), f"{km:.2f}; {ekm:.2f}")
     shown = overview(found, prediction_curves(trials, online.trials), online.events)
     caption = "The paper's numbers (hatched, grey) and those found here; dotted: pushes, and other tendons."

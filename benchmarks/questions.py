@@ -7,13 +7,13 @@ from typing import Any
 
 from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, READINGS, WHOLE_TURNS, Contender
 from matrix import Frame, Question, bands_table, learning_picture, table
-from sensing import hall_table
 from sessions import TARGETS, directions, foresight, there_and_back, turns
+from slides import errors_picture, errors_table, slides, told
 
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.generalize import ENDS, TABLE_I, paper_table, significance_table
 from torch_ekm.experiments.reporting.report import Table
-from torch_ekm.experiments.reporting.tables import controller_table, prediction_table, reason_table
+from torch_ekm.experiments.reporting.tables import controller_table, reason_table
 from torch_ekm.experiments.runner import new_objects
 
 _ANGLES = (9.0, 19.0, 27.0)  # [deg] from fresh grasps
@@ -55,7 +55,7 @@ _ASKED = (
     Question(
         "generalize", "Every object by shares of its workspace, every controller", turns, PLAIN,
         objects=(*TABLE_I, *ENDS), setting=_SEEN, options=_TO_THE_END, columns=(), split="object",
-        more=(controller_table, prediction_table, reason_table, paper_table, significance_table),
+        more=(controller_table, reason_table, paper_table, significance_table),
     ),
     Question(
         "hands", "Hands of other kinds", turns, {name: PLAIN[name] for name in ("E-KM", "KM+S", "KM+I")},
@@ -92,7 +92,7 @@ _ASKED = (
     ),
     Question(
         "sensing", "What each reading is worth", turns, READINGS, setting=_SEEN.replace(engine="mujoco"),
-        options=BY_HAND, split="object", more=(hall_table,),
+        options=BY_HAND, split="object",
         columns=(
             "turns", "lost", "reached", "error [deg]", "by the E-KM [deg]", "joints off by [deg]",
             "motors off by [deg]",
@@ -126,6 +126,12 @@ _ASKED = (
             "estimate off by [deg]", "stated sd [deg]",
         ),
         split="object", short={"learns_by": (), "far": 6.0, "blind": 5.0},
+    ),
+    Question(
+        "slides", "Contacts that slide, open and close", slides, {"KM": Contender("KM")},
+        hands=("described",), options={"motions": 25}, by="plant", columns=(), more=(errors_table,),
+        objects=("box", "can", "bottle", "applier", "flashlight", "jar", "tea_tin", "carton"),
+        picture=errors_picture, told=told, short={"motions": 3},
     ),
 )  # fmt: skip
 QUESTIONS = {asked.name: asked for asked in _ASKED}

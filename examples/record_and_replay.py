@@ -7,6 +7,7 @@ The log goes to the folder "log"; started again, the script makes only what is m
 
 import torch
 
+from torch_ekm.description.registry import file_digests
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import RecordingPlant, ReplayedPlant, TrialLog, verify_log
@@ -14,7 +15,8 @@ from torch_ekm.simulation import SimulatedHand
 
 plant = RecordingPlant(SimulatedHand("planar_two_finger", "can", preset="nominal"))  # or your driver
 draw = torch.Generator().manual_seed(0)
-with TrialLog("log", {"hand": "planar_two_finger", "object": "can"}) as log:
+files = file_digests("planar_two_finger", ["can"])  # so that the log knows what it was made from
+with TrialLog("log", {"hand": "planar_two_finger", "object": "can", "files": files}) as log:
     for trial in log.missing(range(2)):
         seen = plant.reset(trial)
         for _ in range(12):

@@ -298,12 +298,12 @@ class FolderInUseError(EKMError):
 
 
 class WorkerDiedError(EKMError):
-    """The process that ran a job ended without a word, as often as the job was tried."""
+    """A process that ran jobs ended without a word."""
 
-    def __init__(self, job: str, tries: int) -> None:
+    def __init__(self) -> None:
         super().__init__(
-            f"the job '{job}' was run {tries} times, and its process was killed each time; look for "
-            "a lack of memory, or run it with one process"
+            "a process of the run was killed; look for a lack of memory, or take fewer processes: what is "
+            "finished is kept, and the same call goes on"
         )
 
 

@@ -19,8 +19,7 @@ from torch_ekm.model.calibration import Calibration
 from torch_ekm.typing import Array
 
 from .adapting import adapting_predictions
-from .finger_markers import FingerMarkers
-from .fingers import identify_markers
+from .fingers import FingerMarkers, identify_markers
 from .learning import learned_predictions
 from .nominal import (
     NOMINALS,

@@ -6,8 +6,8 @@ a finger that touches a cylinder of known diameter determines the angle at which
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,13 +18,11 @@ from torch_ekm.exceptions import CalibrationError, ParameterError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.typing import Array
 
-from .finger_markers import FingerMarkers
-from .recordings import LINKS
-
 _DISTANCE_STD = 0.5e-3  # [m] of a marker's distance from its joint, in the identification
 _GAP_STD = 1e-3  # [m] between pad and cylinder
 _ANGLE_STD = 0.2  # [rad] markers sit about on the middle of their links
 _FRAMES = 1500  # of a recording, for the identification
+_ITERATIONS = 20  # of Gauss-Newton, for all frames
 _CAMERA_STD = (0.02, 0.003, 0.008)  # [rad, m, m]: how far it may have moved between recordings
 _SEEN_STD = 1e-3  # [m] of a marker's distance from its joint, in the registration: noise and play of a joint
 
@@ -55,11 +53,11 @@ class PlanarFingers:
         """Joint angles ``(n, 4)`` [rad] and what the distances marker to joint are off ``(n, 4)`` [m].
 
         Args:
-            seen: ``(n, 4, 2)`` [m], markers in the order of ``LINKS``.
+            seen: ``(n, 4, 2)`` [m], markers in the order of their links, left_0, right_0, left_1, right_1.
             polar: distance [m] and angle [rad] of each marker in its link ``(4, 2)``.
             camera: ``y = R(phi) x + t``: phi, t ``(3,)``.
         """
-        x = (seen - camera[1:]) @ _turn(camera[0])
+        x = (seen - camera[1:]) @ rotation(camera[0])
         q, off = np.empty((len(x), 4)), np.empty((len(x), 4))
         for f, sign in enumerate(self.sign):
             arm = x[:, f] - self.base[f]
@@ -80,13 +78,62 @@ class PlanarFingers:
             first = math.pi / 2 + sign * q[:, 2 * f]
             second = first + sign * q[:, 2 * f + 1]
             joint = self.base[f] + self.length[f] * _direction(first)
-            local = np.einsum("ni,nij->nj", position - joint, _turn(second))
+            local = np.einsum("ni,nij->nj", position - joint, rotation(second))
             span = self.end[f] - self.start[f]
             share = np.clip((local - self.start[f]) @ span / max(span @ span, 1e-18), 0, 1)
             found[:, f] = (
                 np.linalg.norm(local - self.start[f] - share[:, None] * span, axis=1) - self.radius[f]
             )
         return found
+
+
+@dataclass(frozen=True)
+class FingerMarkers:
+    """Where markers sit in their links, and where the camera is."""
+
+    fingers: PlanarFingers
+    polar: Array
+    """Distance [m] and angle [rad] of each marker in its link ``(4, 2)``."""
+    camera: Array
+    """phi [rad], t [m] of ``y = R(phi) x + t`` ``(3,)``."""
+    noise: float
+    """Standard deviation of a marker's coordinate [m]."""
+
+    def joints(self, seen: Array) -> tuple[Array, Array]:
+        """``min_q |x(q) - x|^2 / sigma^2 + |(q - middle)/spread|^2``: joint angles and their standard
+        deviations ``(n, 4)`` [rad], of the noise of the markers, not of what all frames share.
+
+        A weak prior, uniform over each joint's range, stands in where markers are missing.
+
+        Args:
+            seen: ``(n, 4, 2)`` [m]; NaN: not seen.
+        """
+        fingers, x = self.fingers, (seen - self.camera[1:]) @ rotation(self.camera[0])
+        lower, upper = fingers.hand.joint_lower.clip(-math.pi), fingers.hand.joint_upper.clip(max=math.pi)
+        middle, spread = (lower + upper) / 2, (upper - lower) / math.sqrt(12)
+        q, std = np.tile(middle, (len(x), 1)), np.empty((len(x), 4))
+        for f, sign in enumerate(fingers.sign):
+            own = [2 * f, 2 * f + 1]
+            (near, at_near), (far, at_far) = self.polar[f], self.polar[2 + f]
+            for _ in range(_ITERATIONS):
+                first = math.pi / 2 + sign * q[:, own[0]]
+                second = first + sign * q[:, own[1]]
+                link, end = fingers.length[f] * _direction(first), far * _direction(second + at_far)
+                places = [near * _direction(first + at_near), link + end]
+                miss = np.hstack(
+                    [x[:, f + 2 * k] - fingers.base[f] - place for k, place in enumerate(places)]
+                )
+                J = np.zeros((len(x), 4, 2))
+                J[:, :, 0], J[:, 2:, 1] = np.hstack([_across(place) for place in places]), _across(end)
+                J *= sign
+                J_w = (J * (np.isfinite(miss) / self.noise**2)[..., None]).transpose(0, 2, 1)
+                information = J_w @ J + np.diag(spread[own] ** -2)
+                right = (J_w @ np.nan_to_num(miss)[..., None])[..., 0] + (middle - q)[:, own] / spread[
+                    own
+                ] ** 2
+                q[:, own] += np.linalg.solve(information, right[..., None])[..., 0].clip(-0.5, 0.5)
+            std[:, own] = np.sqrt(np.linalg.inv(information).diagonal(axis1=1, axis2=2))
+        return q, std
 
 
 def identify_markers(hand: HandDescription, markers: Array, pose: Array, diameter: float) -> FingerMarkers:
@@ -114,7 +161,7 @@ def identify_markers(hand: HandDescription, markers: Array, pose: Array, diamete
     def residual(v: Array) -> Array:
         polar, camera = parts(v)
         q, off = fingers.read(seen, polar, camera)
-        gap = fingers.distance(q, (position - camera[1:]) @ _turn(camera[0])) - diameter / 2
+        gap = fingers.distance(q, (position - camera[1:]) @ rotation(camera[0])) - diameter / 2
         scaled = [off / _DISTANCE_STD, gap / _GAP_STD, polar[:, 1] / _ANGLE_STD]
         return np.concatenate([part.ravel() for part in scaled])
 
@@ -126,16 +173,7 @@ def identify_markers(hand: HandDescription, markers: Array, pose: Array, diamete
     polar, camera = parts(fit.x)
     _, off = fingers.read(seen, polar, camera)
     noise = float(np.sqrt(np.mean(off**2)))
-    offset = np.column_stack([polar[:, 0, None] * _direction(polar[:, 1]), np.zeros(4)])
-    unplaced = FingerMarkers(
-        hand=hand,
-        link=LINKS,
-        offset=torch.from_numpy(offset),
-        rotation=torch.eye(3, dtype=torch.float64),
-        translation=torch.zeros(3, dtype=torch.float64),
-        noise=noise,
-    )
-    return _placed(unplaced, camera)
+    return FingerMarkers(fingers, polar, camera, noise)
 
 
 def register_camera(markers: FingerMarkers, seen: Array) -> FingerMarkers:
@@ -144,36 +182,26 @@ def register_camera(markers: FingerMarkers, seen: Array) -> FingerMarkers:
     Distances of markers from their joints are what is measured; where the camera was before is a prior, since
     the fingers of a few frames point about the same way.
     """
-    fingers, before = PlanarFingers(markers.hand), camera_of(markers)
-    offset = markers.offset.numpy()
-    polar = np.column_stack([np.linalg.norm(offset, axis=1), np.arctan2(offset[:, 1], offset[:, 0])])
+    before = markers.camera
 
     def residual(camera: Array) -> Array:
-        _, off = fingers.read(seen, polar, camera)
+        _, off = markers.fingers.read(seen, markers.polar, camera)
         return np.concatenate([off[np.isfinite(off)] / _SEEN_STD, (camera - before) / _CAMERA_STD])
 
     fit = require("scipy.optimize").least_squares(residual, before, loss="soft_l1", x_scale=_CAMERA_STD)
-    return _placed(markers, fit.x)
-
-
-def camera_of(markers: FingerMarkers) -> Array:
-    """phi [rad] and t [m] of ``y = R(phi) x + t`` in the plane ``(3,)``."""
-    R, t = markers.rotation.numpy(), markers.translation.numpy()
-    return np.array([math.atan2(R[1, 0], R[0, 0]), t[0], t[1]])
-
-
-def _placed(markers: FingerMarkers, camera: Array) -> FingerMarkers:
-    rotation, translation = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    rotation[:2, :2] = torch.from_numpy(_turn(camera[0]))
-    translation[:2] = torch.from_numpy(camera[1:].copy())
-    return dataclasses.replace(markers, rotation=rotation, translation=translation)
+    return replace(markers, camera=fit.x)
 
 
 def _direction(angle: Array) -> Array:
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _turn(angle: Array | float) -> Array:
+def _across(arm: Array) -> Array:
+    """Turned by a right angle: the derivative by the angle of an arm."""
+    return np.stack([-arm[..., 1], arm[..., 0]], axis=-1)
+
+
+def rotation(angle: Array | float) -> Array:
     """``R(angle)``, ``(*batch, 2, 2)``."""
     c, s = np.cos(angle), np.sin(angle)
     return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)

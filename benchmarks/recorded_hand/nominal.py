@@ -18,6 +18,7 @@ from torch_ekm.model.calibration import Calibration, calibrate
 from torch_ekm.plant import Observation, PlantStatus, Trajectory
 from torch_ekm.typing import Array
 
+from .fingers import rotation
 from .recordings import RecordedPath
 from .states import OPTIONS, STRIDE, States, cylinder
 
@@ -122,9 +123,7 @@ def jacobians(hand: HandDescription, states: States, *, rigid: bool) -> Array:
     believed = np.abs(J[:, :2]).max((1, 2)) < LARGEST
     usual = np.median(J[believed], axis=0) if believed.any() else np.zeros((3, 2))
     J = np.where(believed[:, None, None], J, usual)
-    c, s = np.cos(states.camera[:, 0]), np.sin(states.camera[:, 0])
-    turn = np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
-    return np.concatenate([turn @ J[:, :2], J[:, 2:]], axis=1)
+    return np.concatenate([rotation(states.camera[:, 0]) @ J[:, :2], J[:, 2:]], axis=1)
 
 
 def constant_jacobian(action: Array, motion: Array) -> Array:

@@ -21,8 +21,6 @@ SKIPPED = ("str40_d_v1",)
 UNIT = 0.97e-3
 """Motion of a motor in one step per unit of action [rad], from the settings of the recording's authors."""
 STEP = 0.1  # [s]
-LINKS = ("left_0", "right_0", "left_1", "right_1")
-"""Of the four markers, in their order."""
 _RED = "_red_"
 _NOT_SEEN = 0.3  # [m]: what was not seen is written as a place a metre away
 

@@ -20,8 +20,7 @@ from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelOptions
 from torch_ekm.typing import Array
 
-from .finger_markers import FingerMarkers
-from .fingers import PlanarFingers, camera_of, register_camera
+from .fingers import FingerMarkers, register_camera, rotation
 from .projection import project_onto_contacts
 from .recordings import RecordedPath, known_diameter
 
@@ -111,16 +110,14 @@ def estimate_states(
     for number, path in enumerate(paths):
         last = None
         for steps, known, diameter in _epochs(name, paths, number, markers):
-            model, camera = KinematicModel(hand, cylinder(diameter), OPTIONS), camera_of(known)
-            q, covariance = known.joints(
-                torch.from_numpy(np.array([_recent(path.markers, t) for t in steps]))
-            )
+            model, camera = KinematicModel(hand, cylinder(diameter), OPTIONS), known.camera
+            found = known.joints(np.array([_recent(path.markers, t) for t in steps]))
+            q, std = map(torch.from_numpy, found)
             pose = np.array([_recent(path.pose, t) for t in steps])
             position = np.zeros((len(steps), 3))
-            position[:, :2] = (pose[:, :2] - camera[1:]) @ _rotation(camera[0])
+            position[:, :2] = (pose[:, :2] - camera[1:]) @ rotation(camera[0])
             angle = path.pose[steps, 2] - camera[0]
             place, turn = torch.from_numpy(position), upright(angle)
-            std = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
             for k, step in enumerate(steps):
                 angles, spread = q[k], std[k]
                 if last is not None:  # an angle that no marker shows is about what it was
@@ -170,10 +167,10 @@ def _some(looks: list[tuple[int, Array, Array]]) -> tuple[Array, Array]:
 
 def _diameter(markers: FingerMarkers, seen: Array, pose: Array) -> float:
     """Of the cylinder that the pads would touch about the object's reference point: the median."""
-    camera = camera_of(markers)
-    q = markers.joints(torch.from_numpy(seen)).q.numpy()
-    position = (pose[:, :2] - camera[1:]) @ _rotation(camera[0])
-    distance = PlanarFingers(markers.hand).distance(q, position)
+    camera = markers.camera
+    q, _ = markers.joints(seen)
+    position = (pose[:, :2] - camera[1:]) @ rotation(camera[0])
+    distance = markers.fingers.distance(q, position)
     measured = distance[np.isfinite(seen[:, 2:]).all(-1)]  # by a finger whose distal marker is seen
     return float(np.clip(2 * np.median(measured), *_DIAMETERS)) if measured.size else _USUAL
 
@@ -223,8 +220,3 @@ def _recent(values: Array, step: int) -> Array:
     window = values[max(0, step - _WINDOW + 1) : step + 1]
     seen = np.isfinite(window).any(axis=0)
     return np.where(seen, np.nanmedian(np.where(seen, window, 0.0), axis=0), np.nan)
-
-
-def _rotation(angle: float) -> Array:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s], [s, c]])

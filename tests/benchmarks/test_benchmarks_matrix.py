@@ -20,7 +20,7 @@ import matrix
 from contenders import BEGINNINGS, PARTS, PLANS, PRINTED, READINGS, WHOLE_TURNS, MisprintedBench
 from experiments_records import frame
 from hands import CONDITIONS, FAMILIES, OTHERS, STRENGTHS, hands
-from matrix import FIGURES, bands_table, pivot, verdict
+from matrix import FIGURES, bands_table, ends_table, verdict
 from questions import QUESTIONS
 from sessions import TARGETS, Part, target_of
 
@@ -96,7 +96,8 @@ def test_lost_reached_movements_and_bands_are_counted() -> None:
     # the first five motions with the object, over its turns
     assert FIGURES["E-KM, first 5 [deg]"].of(mine) == pytest.approx((0.4 + 0.2 + 0.1 * 3) / 5)
     assert FIGURES["KM, first 5 [deg]"].of(mine) == pytest.approx(0.5)
-    assert pivot(turns, "contender", "plant").text() == [["odd 4", "6", "2, 2, 2.5", "0, 1, 9.0"]]
+    cells = ["6", "2, 2, 2.5", "0, 1, 9.0"]
+    assert ends_table(turns, "contender", "plant").text() == [["odd 4", *cells], ["all", *cells]]
     (bands,) = bands_table(turns).text()
     assert bands == ["E-KM", "2", "50 % of 2", "100 % of 2", "50 % of 2"]
 
@@ -167,7 +168,7 @@ def test_movements_of_a_loop_without_watch_go_to_their_end(tmp_path: Path, monke
         assert bool(asked) == watched
 
 
-@pytest.mark.parametrize("name", ["generalize", "series", "directions", "printed", "new_object"])
+@pytest.mark.parametrize("name", ["generalize", "series", "directions", "printed", "new_object", "slides"])
 def test_every_kind_of_session_runs(name: str, tmp_path: Path) -> None:
     asked = QUESTIONS[name]
     made = matrix.ask(asked, ["--quick", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)])

@@ -13,7 +13,7 @@ import pytest
 import recorded_hand.benchmark
 import torch
 from recorded_hand.benchmark import predict_recorded_hand
-from recorded_hand.fingers import PlanarFingers, camera_of, identify_markers, register_camera
+from recorded_hand.fingers import FingerMarkers, PlanarFingers, identify_markers, register_camera
 from recorded_hand.nominal import through_play
 from recorded_hand.recordings import APART, UNIT, RecordedPath, read_recordings
 from recorded_hand.report import write_report
@@ -77,14 +77,13 @@ def test_markers_and_camera_are_found_where_they_were_put(folder):
     markers = identify_markers(
         load_hand("yale_t42"), whole(apart, "markers"), whole(apart, "pose"), OBJECTS[APART]
     )
-    found = markers.offset[:, :2].numpy()
-    placed = np.array([[r * math.cos(a), r * math.sin(a)] for r, a in _MARKERS])
+    found, placed = ([[r * math.cos(a), r * math.sin(a)] for r, a in of] for of in (markers.polar, _MARKERS))
     # 26 s of small motions tell a place to 2 mm, and the distal one across its link through the contact
-    assert np.linalg.norm(found - placed, axis=1).max() < 3e-3
+    assert np.linalg.norm(np.subtract(found, placed), axis=1).max() < 3e-3
     assert 1e-4 < markers.noise < 4e-4
     red = register_camera(markers, whole(recordings["cyl35_red_d_v0"], "markers")[::10])
-    np.testing.assert_allclose(camera_of(red)[1:], _CAMERA["red"][1:], atol=3e-3)
-    assert camera_of(red)[0] == pytest.approx(_CAMERA["red"][0], abs=0.03)
+    np.testing.assert_allclose(red.camera[1:], _CAMERA["red"][1:], atol=3e-3)
+    assert red.camera[0] == pytest.approx(_CAMERA["red"][0], abs=0.03)
 
 
 def test_fingers_in_closed_form_agree_with_the_chain():
@@ -108,6 +107,22 @@ def test_fingers_in_closed_form_agree_with_the_chain():
     np.testing.assert_allclose(fingers.distance(q, position), gaps, atol=1e-7)
     with pytest.raises(ParameterError, match="left_0"):
         PlanarFingers(load_hand("icub_right"))
+
+
+def test_angles_say_how_sure_they_are_and_hidden_ones_are_left_to_their_range():
+    from recorded_hand.synthetic import _marker_points
+
+    hand, draw = load_hand("yale_t42"), np.random.default_rng(0)
+    markers = FingerMarkers(PlanarFingers(hand), np.array(_MARKERS), np.zeros(3), 3e-4)
+    q = draw.uniform([-0.5, 0.1, -0.5, 0.1], [0.3, 0.9, 0.3, 0.9], size=(400, 4))
+    seen = _marker_points(hand, q) + 3e-4 * draw.standard_normal((400, 4, 2))
+    found, std = markers.joints(seen)
+    assert np.sqrt(np.square((found - q) / std).mean(0)) == pytest.approx(np.ones(4), abs=0.15)
+    seen[0, 2] = np.nan  # of left_1
+    hidden, spread = markers.joints(seen[:1])
+    assert hidden[0, 2:].tolist() == found[0, 2:].tolist()
+    assert hidden[0, 1] == pytest.approx((hand.joint_lower[1] + hand.joint_upper[1]) / 2)
+    assert spread[0, 1] > 10 * std[0, 1]
 
 
 def test_play_begins_at_its_closing_end():

@@ -22,5 +22,3 @@ def test_what_each_reading_is_worth(tmp_path: Path) -> None:
     assert 0.05 < float(rows["all sensed"][5]) < 2.0  # [deg] of joints
     assert float(rows["true joint angles"][5]) == 0.0
     assert 0.01 < float(rows["all sensed"][6]) < 3.0  # [deg] of motors
-    hall = {text[0]: text[1:] for text in made.tables[1].text()}
-    assert 0.1 < float(hall["index_1"][0]) < 1.0  # [deg] Hall fit

@@ -16,7 +16,6 @@ from torch_ekm._terminal import as_printed, print_report, print_table, progress,
 from torch_ekm.cli import app, main
 from torch_ekm.cli._help import GROUPS
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
-from torch_ekm.experiments.reporting.report import unbroken as unbroken_html
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan
 from torch_ekm.plant import Trajectory, TrialLog
 
@@ -72,8 +71,6 @@ def test_figures_with_their_intervals_are_not_broken_over_lines() -> None:
         assert " ".join(lines) == text
         for figure in ("0.10 [0.07, 0.12] deg", "101 [99, 107] %"):
             assert sum(figure in line for line in lines) == 1
-    assert ">0.10 [0.07, 0.12] deg</span>" in unbroken_html(text)
-    assert "&lt;b&gt;" in unbroken_html("<b>")
 
 
 @pytest.mark.parametrize("width", [60, 100])
@@ -95,7 +92,6 @@ def test_a_table_that_is_too_wide_is_printed_in_parts(
 
 def test_some_help_has_units_in_brackets() -> None:
     assert "[deg]" in CliRunner().invoke(app, ["reproduce", "--help"]).output
-    assert "[deg]" in CliRunner().invoke(app, ["record", "--help"]).output
 
 
 def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -145,11 +141,10 @@ def test_what_the_system_refuses_is_told_in_a_line(
 ) -> None:
     (tmp_path / "file").touch()
     nowhere = str(tmp_path / "file" / "log")
-    for arguments in (["record", nowhere], ["reproduce", "online", "--quick", "--out", nowhere]):
-        monkeypatch.setattr("sys.argv", ["torch-ekm", *arguments])
-        with pytest.raises(SystemExit):
-            main()
-        assert "cannot be written" in capsys.readouterr().err
+    monkeypatch.setattr("sys.argv", ["torch-ekm", "reproduce", "online", "--quick", "--out", nowhere])
+    with pytest.raises(SystemExit):
+        main()
+    assert "cannot be written" in capsys.readouterr().err
 
 
 def test_verify(tmp_path: Path) -> None:
@@ -181,7 +176,6 @@ def test_a_page_begins_with_the_answer_and_folds_the_rest(tmp_path: Path) -> Non
     )
     places = [page.index(part) for part in order]
     assert places == sorted(places)
-    assert '<span class="figure">0.1 [0.0, 0.2] deg</span>' in page
 
 
 def test_every_command_stands_in_a_group_with_a_whole_sentence() -> None:

@@ -56,9 +56,9 @@ reproduce online --angles 5 | 'online' does not take it
 reproduce generalize --objects nothing | unknown object
 reproduce generalize --objects , | at least one object
 reproduce generalize --angles x | numbers separated by commas
-reproduce generalize --angles 0 | more than 0 and less than 180 deg
-reproduce generalize --angles nan | more than 0 and less than 180 deg
-reproduce generalize --angles 400 | more than 0 and less than 180 deg
+reproduce generalize --angles 0 | angles between 0 and 180 deg
+reproduce generalize --angles nan | angles between 0 and 180 deg
+reproduce generalize --angles 400 | angles between 0 and 180 deg
 reproduce generalize --preset bad | unknown preset
 reproduce generalize --learner bad | unknown learner
 compare | Missing option '--data'
@@ -75,11 +75,6 @@ compare --data s.csv --targets a,y | at least one must be an input
 compare --data s.csv --limit -1 | --limit
 compare --data s.csv --limit 3 | too short
 compare --data s.csv --learners SOGP --out file.txt | cannot be written
-record file.txt | a log is a folder
-record log --object nothing | unknown object
-record log --controller bad | unknown controller
-record log --angles '' | numbers separated by commas
-record log --seeds -3:2 | 0 <= FIRST < END
 show nothing | unknown hand or log
 show file.txt | damaged, or not a recording
 show folder | no log

@@ -108,17 +108,8 @@ def test_tables_hold_the_scores(compared: Comparison) -> None:
     assert row[0].endswith("*")
     assert row[1] == compared.scores["linear", "linear RLS"].rms
     assert row[3] is None  # it is the best itself
-    assert [row[0] for row in overview_table(compared).rows] == ["linear RLS", "SOGP plain", "model alone"]
-
-
-def test_ranks_share_ties(compared: Comparison) -> None:
-    assert compared.ranks().sum(1) == pytest.approx([6.0, 6.0])
-    score, errors = (of["linear", "linear RLS"] for of in (compared.scores, compared.errors))
-    both = [("linear", "a"), ("linear", "b")]
-    twice = Comparison(
-        compared.streams[:1], ("a", "b"), dict.fromkeys(both, score), dict.fromkeys(both, errors)
-    )
-    assert twice.ranks().tolist() == [[1.5, 1.5]]
+    assert [row[0] for row in overview_table(compared).rows] == ["model alone", "linear RLS", "SOGP plain"]
+    assert [cell.endswith("*") for cell in overview_table(compared).rows[1][1:]] == [True, True]
 
 
 def test_samples_that_go_together_widen_the_interval() -> None:
@@ -155,7 +146,7 @@ def test_what_cannot_be_compared() -> None:
         Stream("uneven", torch.zeros(50, 2), torch.zeros(49, 1))
 
 
-@pytest.mark.parametrize("name", [*COMPARED, "rbf"])
+@pytest.mark.parametrize("name", COMPARED)
 def test_every_contender_runs(name: str) -> None:
     result = run_one(linear(44), learner_factory(name))
     assert len(result["squared"]) == 24

@@ -81,12 +81,6 @@ def test_a_result_is_that_of_its_job(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_bytes(other)
     with pytest.raises(ValueError, match="another job, 'b'"):
         read_result(tmp_path / "a.json", "a")
-    for bit in range(0, 8 * len(mine), 5):
-        flipped = bytearray(mine)
-        flipped[bit // 8] ^= 1 << bit % 8
-        (tmp_path / "a.json").write_bytes(flipped)
-        with pytest.raises(ValueError, match=r"JSON|result|digest"):
-            read_result(tmp_path / "a.json", "a")
 
 
 def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
@@ -112,27 +106,22 @@ def test_a_failure_cancels_what_has_not_begun(tmp_path: Path) -> None:
     assert len(list(traces.iterdir())) == begun < 60
 
 
-def test_a_job_whose_process_was_killed_is_run_again_and_named_if_it_dies_each_time(tmp_path: Path) -> None:
+def test_a_run_whose_process_was_killed_says_so_and_goes_on(tmp_path: Path) -> None:
     def die(folder: str, x: int) -> int:
-        """The process of the job 0 is killed from outside the first time, that of the job 1 each time.
-
-        Its last time comes when the job 0 is done.
-        """
-        traces = Path(folder) / "traces"
-        times = len(list(traces.glob(f"{x}_*")))
-        (traces / f"{x}_{times}").touch()
-        while x == 1 and times == 2 and not (Path(folder) / "job_0.json").exists():
+        """The process of the job 1 is killed from outside, once, when the job 0 is done."""
+        died = Path(folder) / "died"
+        while x == 1 and not (Path(folder) / "job_0.json").exists():
             time.sleep(0.05)
-        if x == 1 or times == 0:
+        if x == 1 and not died.exists():
+            died.touch()
             os.kill(os.getpid(), signal.SIGKILL)
         return x
 
-    (tmp_path / "traces").mkdir()
-    with pytest.raises(WorkerDiedError, match="'job_1' was run 3 times"):
-        run_jobs(die, {f"job_{x}": (str(tmp_path), x) for x in range(2)}, tmp_path, processes=2)
+    jobs = {f"job_{x}": (str(tmp_path), x) for x in range(2)}
+    with pytest.raises(WorkerDiedError, match="the same call goes on"):
+        run_jobs(die, jobs, tmp_path, processes=2)
     assert read_result(tmp_path / "job_0.json", "job_0") == 0
-    times = sorted(path.name for path in (tmp_path / "traces").iterdir())
-    assert times == ["0_0", "0_1", "1_0", "1_1", "1_2"]
+    assert run_jobs(die, jobs, tmp_path, processes=2) == {"job_0": 0, "job_1": 1}
 
 
 SLEEPERS = """

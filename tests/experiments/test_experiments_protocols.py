@@ -14,7 +14,7 @@ from torch_ekm.control import DEFAULT_TASKS, EffortTask, OneStep, Safety, StepBo
 from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
-from torch_ekm.experiments.learners import LEARNERS, make_learner
+from torch_ekm.experiments.learners import HAND_LEARNERS, make_learner
 from torch_ekm.experiments.protocols.generalize import (
     ENDS,
     OTHER_ANGLES,
@@ -69,7 +69,7 @@ def test_results_are_kept_under_all_that_decides_them(monkeypatch: pytest.Monkey
     for figures in ({"planner": OneStep()}, {"bound": None}, {"safety": Safety(StoppingRule(max_steps=9))}):
         assert of(Setting(**figures)) == of(copy.deepcopy(Setting(**figures))) != unchanged
     with monkeypatch.context() as patch:  # a version whose learner has another kernel
-        patch.setitem(LEARNERS, "action-linear", LEARNERS["SOGP plain"])
+        patch.setitem(HAND_LEARNERS, "action-linear", HAND_LEARNERS["rbf"])
         assert of(Setting()) != unchanged
     assert of(Setting()) == unchanged
     assert of(Setting(capacity=59)) != unchanged
@@ -110,8 +110,7 @@ def test_every_object_is_asked_for_shares_of_its_end() -> None:
 def test_every_learner_for_a_hand_starts_at_zero_and_learns() -> None:
     generator = torch.Generator().manual_seed(0)
     slope = torch.randn(4, 6, generator=generator, dtype=torch.float64)
-    names = ("action-linear", "rbf", "SOGP plain", "SOGP deep", "linear RLS", "random features")
-    for name in (*names, "MLP", "model alone"):
+    for name in HAND_LEARNERS:
         learner = make_learner(name, 5, 4, 30)
         x = torch.randn(120, 9, generator=generator, dtype=torch.float64)
         y = x[:, 5:] @ slope
@@ -119,7 +118,7 @@ def test_every_learner_for_a_hand_starts_at_zero_and_learns() -> None:
         learner.update(x, y)
         better = float((learner(x) - y).square().mean() / y.square().mean())
         assert better == 1.0 if name == "model alone" else better < 0.7, (name, better)
-    with pytest.raises(UnknownNameError, match="deep"):
+    with pytest.raises(UnknownNameError, match="rbf"):
         make_learner("forest", 5, 4, 30)
 
 

@@ -190,12 +190,3 @@ def test_command_line(folder, tmp_path) -> None:
     assert page.exists()
     failed = runner.invoke(app, ["replay", str(tmp_path / "nothing")])
     assert isinstance(failed.exception, DescriptionError)
-    made = tmp_path / "made"
-    arguments = ["record", str(made), "--seeds", "0:1", "--preset", "none", "--no-sensing", "--angles", "3"]
-    done = runner.invoke(app, arguments)
-    assert done.exit_code == 0, done.output
-    assert TrialLog.open(made).index[0].reason == "reached"
-    assert "1 reached" in done.output.replace("\n", " ")
-    failed = runner.invoke(app, [*arguments[:-1], "x,3"])
-    assert isinstance(failed.exception, ParameterError)
-    assert "x,3" in str(failed.exception)

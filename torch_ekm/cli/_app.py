@@ -70,14 +70,12 @@ def parse_angles(text: str) -> tuple[float, ...]:
     """``"10,20"`` as (10.0, 20.0) [deg].
 
     Raises:
-        ParameterError: no number, or one that is no rotation.
+        ParameterError: no numbers.
     """
-    valid = "numbers separated by commas, of more than 0 and less than 180 deg, e.g. 10,20"
-    angles = [figure(word) for word in names(text)]
-    known = tuple(angle for angle in angles if angle is not None and 0 < abs(angle) < 180)
-    if not known or len(known) < len(angles):
-        raise ParameterError("angles", text, valid)
-    return known
+    angles = tuple(angle for word in names(text) if (angle := figure(word)) is not None)
+    if not angles or len(angles) < len(names(text)):
+        raise ParameterError("angles", text, "numbers separated by commas, e.g. 10,20")
+    return angles
 
 
 def names(text: str) -> tuple[str, ...]:

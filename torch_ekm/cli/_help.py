@@ -13,7 +13,7 @@ GROUPS = {
     "Try it in simulation": ("demo", "reproduce"),
     "Describe a hand": ("hands", "objects", "check", "show"),
     "Recordings of any robot": ("compare",),
-    "Logs of a hand": ("record", "replay", "verify", "health"),
+    "Logs of a hand": ("replay", "verify", "health"),
     "A real hand": ("drivers", "slack", "identify-servo", "knowledge"),
     "The package": ("notebooks", "version"),
 }

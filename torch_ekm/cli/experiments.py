@@ -58,9 +58,7 @@ def reproduce(
     hand: Hand = "icub_right",
     preset: Preset = "nominal",
     engine: Engine = "sapien",
-    learner: Annotated[
-        str, Option(help="action-linear, rbf, SOGP deep, ...; an unknown name lists all.")
-    ] = "action-linear",
+    learner: Annotated[str, Option(help="action-linear, rbf, or model alone.")] = "action-linear",
     sensing: Sensing = True,
     angles: Annotated[str, Option(help="Turns [deg], e.g. 5,10; else shares of each end (generalize).")] = "",
 ) -> None:
@@ -96,7 +94,7 @@ def compare(
         str,
         Option(
             help="Names, separated by commas: default, SOGP, linear RLS, model alone, ...; an "
-            "unknown name lists all. If left out: all but rbf, action-linear and those of other libraries."
+            "unknown name lists all. If left out: all but those of other libraries."
         ),
     ] = "",
     targets: Annotated[str, Option("--targets", "--measured", help="To predict; else y, y1, ...")] = "",
@@ -151,20 +149,11 @@ def compare(
     say_next("EnhancedModel(f, learner) in your loop; the call of each name: docs/how_to/choose_a_learner.md")
 
 
-def _left_out(planned: Experiment) -> str:
-    """What of the whole experiment is not run."""
-    whole, which = type(planned.protocol)(), "new" if hasattr(planned.protocol, "new") else "objects"
-    taken = getattr(planned.protocol, which, ())
-    missing = [name for name in getattr(whole, which, ()) if name not in taken]
-    seeds = ", ".join(map(str, planned.seeds))
-    return f"Seeds {seeds}; left out: {', '.join([*missing, 'other seeds', 'larger turns'])}."
-
-
 def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> None:
     from ..experiments.reproduce import reproduce as run
 
     if planned.quick:
-        say(f"A trial run, which claims nothing. {_left_out(planned)}")
+        say("A trial run, which claims nothing.")
     n, each = len(planned.jobs), _QUICK if planned.quick else _SESSION.get(what, 20)
     with progress(what, n, n * each / jobs) as advance:
         report = run(planned, folder, jobs, advance)

@@ -2,56 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from .._terminal import print_table, progress, say, say_next
-from ._app import AN_OBJECT, Engine, Hand, Page, Preset, Sensing, app, parse_angles, parse_seeds
+from .._terminal import print_table, say, say_next
+from ._app import Page, app
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
 
 if TYPE_CHECKING:
     from ..inspection.view import View
-
-_TURN = 10  # seconds on a free core
-
-
-@app.command()
-def record(
-    log: Annotated[Path, Argument(help="Folder of the log; an existing one is continued.")],
-    object: Annotated[str, Option(help=AN_OBJECT)] = "box",
-    hand: Hand = "icub_right",
-    angles: Annotated[str, Option(help="Turns [deg], e.g. 10,20.")] = "10,20",
-    seeds: Annotated[str, Option(help="FIRST:END; each angle is turned once for each seed.")] = "0:3",
-    controller: Annotated[str, Option(help="KM, KM+I, KM+S or E-KM.")] = "KM",
-    preset: Preset = "nominal",
-    engine: Engine = "sapien",
-    sensing: Sensing = True,
-    images: Annotated[bool, Option(help="Keep the camera's images too.")] = False,
-) -> None:
-    """Turn an object in the simulated hand, and log all of it.
-
-    One HDF5 file for each turn. Interrupted or killed, it continues where it stopped, and ends with the same
-    files.
-    """
-    from ..experiments.config import Setting
-    from ..experiments.protocols.record import RecordConfig
-    from ..experiments.protocols.record import record as run
-
-    setting = Setting(hand=hand, preset=preset, engine=engine, sensing=sensing)
-    config = RecordConfig(setting, object, controller, parse_angles(angles))
-    chosen = parse_seeds(seeds)
-    n = len(chosen) * len(config.angles_deg)
-    with progress("recording", n, n * _TURN) as advance:
-        made = run(config, chosen, log, on_trial=advance)
-    ends = Counter(e.status if e.status == "not grasped" else e.reason or e.status for e in made.index)
-    say(f"{made.folder.resolve()}: {', '.join(f'{n} {end}' for end, n in ends.items())}")
-    if set(ends) == {"not grasped"}:
-        say_next(f"torch-ekm check {hand} {object} says why no pinch holds")
-        raise typer.Exit(1)
-    say_next(f"torch-ekm replay {log}")
 
 
 @app.command()
@@ -99,7 +60,7 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
     """Check every byte of a log.
 
     Its trials, and the files of hand and object that it was made from. Ends with 1 if a file is
-    wrong, with 0 if not. "torch-ekm record" makes damaged trials again.
+    wrong, with 0 if not.
     """
     from ..plant import verify_log
     from ..plant.verification import Finding
@@ -107,7 +68,7 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
     found = verify_log(log)
     print_table(Finding._fields, found, str(log))
     if any(one.state == "wrong" for one in found):
-        say_next("torch-ekm record makes trials of a simulated hand again; of a real one use your copy")
+        say_next("use your copy; trials of a simulated hand can be made again")
         raise typer.Exit(1)
     say_next(f"torch-ekm health {log}")
 

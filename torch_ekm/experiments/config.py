@@ -28,7 +28,7 @@ from ..description.registry import file_digests
 from ..exceptions import ParameterError, UnknownNameError
 from ..model import ModelOptions
 from ..simulation import ENGINES, PlantConfig, PlantParameters, preset
-from .learners import DEFAULT_LEARNER, LEARNERS, make_learner
+from .learners import DEFAULT_LEARNER, HAND_LEARNERS, make_learner
 
 #: The controllers that are compared on the same seeds, grasps, limits and stopping rule. "+I" is integral
 #: action: the increments accumulate on the set-point instead of the encoder, which learns nothing. "+S" is
@@ -80,7 +80,7 @@ class Setting:
     def __post_init__(self) -> None:
         if self.hand not in list_hands() and not Path(self.hand).exists():
             raise UnknownNameError("hand", self.hand, (*list_hands(), "a path to a .urdf file"))
-        for name, known in (("learner", LEARNERS), ("engine", ENGINES)):
+        for name, known in (("learner", HAND_LEARNERS), ("engine", ENGINES)):
             if getattr(self, name) not in known:
                 raise UnknownNameError(name, getattr(self, name), known)
         for name in ("capacity", "frames"):

@@ -1,4 +1,4 @@
-"""Every learner by name, for any stream and for a grasp."""
+"""Learners by name: of any stream, which are compared, and of a hand."""
 
 from __future__ import annotations
 
@@ -20,44 +20,43 @@ Factory = Callable[..., ResidualLearner]
 
 #: Inputs and outputs of the order of 1 are taken as they are.
 _AS_GIVEN: dict[str, Any] = {"noise_variance": NOISE_VARIANCE, "standardize": False}
+_FRESH: dict[str, Any] = {**_AS_GIVEN, "forgetting_factor": 0.99, "robust": 3.0}
 
 
-def _kind(make: Factory, size: str = "", kernel: str = "", **figures: Any) -> Factory:
-    """A factory ``(in_features, out_features, n_actions=0, capacity=100, **options)`` of one kind of learner.
+def _kind(make: Factory, size: str = "", **figures: Any) -> Factory:
+    """A factory ``(in_features, out_features, capacity=100, **options)`` of one kind of learner.
 
     Args:
         make: its class, or a function.
-        size, kernel: names of its arguments for the capacity and the kernel; "": it has none.
+        size: name of its argument for the capacity; "": it has none.
         figures: its other arguments.
     """
 
-    def factory(
-        d: int, m: int, *, n_actions: int = 0, capacity: int = 100, **options: Any
-    ) -> ResidualLearner:
-        given = {size: capacity, kernel: residual.SquaredExponential(d)}
-        return make(d, m, **{**figures, **{name: given[name] for name in given if name}, **options})
+    def factory(d: int, m: int, *, capacity: int = 100, **options: Any) -> ResidualLearner:
+        return make(d, m, **{**figures, **({size: capacity} if size else {}), **options})
 
     return factory
 
 
 def _sparse(
-    make: Factory = residual.SparseOnlineGP, kernel: str = "kernel", parts: Any = (), **figures: Any
-) -> Factory:
+    make: Factory = residual.SparseOnlineGP, of_kernel: str = "kernel", **own: Any
+) -> Callable[..., ResidualLearner]:
     """A sparse online GP that distrusts and forgets by two figures, and has other parts."""
-    plain = _kind(make, "capacity", kernel, **_AS_GIVEN)
-    own = {"robust": None, "forgetting_factor": 1.0, "parts": parts, **figures}
 
-    def factory(d: int, m: int, **options: Any) -> ResidualLearner:
-        chosen = {name: options.pop(name, value) for name, value in own.items()}
-        return plain(d, m, **options, parts=_parts(**chosen))
+    def factory(d: int, m: int, *, capacity: int = 100, **options: Any) -> ResidualLearner:
+        given = {
+            **_AS_GIVEN,
+            "capacity": capacity,
+            of_kernel: residual.SquaredExponential(d),
+            **own,
+            **options,
+        }
+        robust, fading = given.pop("robust", None), given.pop("forgetting_factor", 1.0)
+        parts = [] if robust is None else [residual.RobustWeight(robust)]
+        parts += [] if fading == 1.0 else [residual.ForgettingFactor(fading)]
+        return make(d, m, **{**given, "parts": [*parts, *given.get("parts", ())]})
 
     return factory
-
-
-def _parts(robust: float | None, forgetting_factor: float, parts: Any) -> list[Any]:
-    weight = [] if robust is None else [residual.RobustWeight(robust)]
-    fading = [] if forgetting_factor == 1.0 else [residual.ForgettingFactor(forgetting_factor)]
-    return [*weight, *fading, *parts]
 
 
 def _mixture(d: int, m: int, **options: Any) -> ResidualLearner:
@@ -65,35 +64,16 @@ def _mixture(d: int, m: int, **options: Any) -> ResidualLearner:
     return residual.MixtureResidual([kind(d, m, **options) for kind in _MIXED])
 
 
-def _rbf(d: int, m: int, *, n_actions: int = 0, **options: Any) -> ResidualLearner:
-    """Takes up the dead zone, too: smooth over 15 cm and 4.5 rad of the state and 8 deg of an actuator."""
-    lengthscale = torch.tensor([15.0] * (d - n_actions) + [4.0] * n_actions, dtype=torch.float64)
-    kernel = residual.SquaredExponential(d, lengthscale=lengthscale, variance=4.0)
-    return _ON_A_HAND(d, m, **{"kernel": kernel, **options})
-
-
-def _action_linear(
-    d: int, m: int, *, n_actions: int = 0, action_variance: float = ACTION_VARIANCE, **options: Any
-) -> ResidualLearner:
-    """The learner of :meth:`EnhancedModel.for_grasp`."""
-    kernel = grasp_kernel(d - n_actions, n_actions, action_variance)
-    return _ON_A_HAND(d, m, **{"kernel": kernel, **options})
-
-
 _MIXED = (
     _sparse(residual.DeepKernelSOGP, "base", robust=3.0),
     _sparse(robust=3.0, parts=[residual.ProcessNoise(0.003), residual.LearnHyperparameters()]),
 )
-_ON_A_HAND = _sparse(robust=3.0, forgetting_factor=0.995)
-_FRESH: dict[str, Any] = {**_AS_GIVEN, "forgetting_factor": 0.99, "robust": 3.0}
 
-#: Name -> ``factory(in_features, out_features, n_actions=0, capacity=100, **options)``; the last n_actions
-#: inputs are an action. Inputs and outputs are of the order of 1; all but the first three start from the same
-#: generic prior: lengthscale sqrt(d), unit variance, and about 100 of whatever they keep.
+#: Name -> ``factory(in_features, out_features, capacity=100, **options)``. Inputs and outputs are of the
+#: order of 1; all but the first start from the same generic prior: lengthscale sqrt(d), unit variance, and
+#: about 100 of whatever they keep.
 LEARNERS: dict[str, Factory] = {
     "default": _kind(residual.default_learner, "capacity"),
-    "action-linear": _action_linear,
-    "rbf": _rbf,
     "model alone": _kind(residual.ZeroResidual),
     "linear RLS": _kind(residual.RecursiveLeastSquares, **_FRESH),
     "random features": _kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
@@ -112,21 +92,10 @@ LEARNERS: dict[str, Factory] = {
     "SOGP mixture": _mixture,
     "river forest": _kind(interop.RiverResidual),
 }
-#: Learners of other libraries: ten to a hundred times as slow, and in an extra of their own.
-PEERS = ("river forest",)
 #: The default learner, and the sparse online GP in its forms.
 OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
-#: What a comparison takes if nobody says otherwise: not those that want to know which inputs are an action.
-COMPARED = tuple(name for name in LEARNERS if name not in (*PEERS, "rbf", "action-linear"))
-#: What demo and experiments take if nobody names another.
-DEFAULT_LEARNER = "action-linear"
-#: What a hand wants other than any stream: it wears slowly, and a motion says little of a slope.
-_HAND_FIGURES: dict[str, dict[str, Any]] = {
-    "SOGP deep": {"forgetting_factor": 0.995, "parts": ()},
-    "linear RLS": {"forgetting_factor": 0.995, "weight_variance": 0.1},
-    "random features": {"forgetting_factor": 0.995},
-    "model alone": {"noise_variance": NOISE_VARIANCE},
-}
+#: What a comparison takes if nobody says otherwise: not those of other libraries, which are slow.
+COMPARED = tuple(name for name in LEARNERS if name != "river forest")
 
 
 def learner_factory(name: str) -> Factory:
@@ -140,16 +109,42 @@ def learner_factory(name: str) -> Factory:
     return LEARNERS[name]
 
 
+def _action_linear(
+    n_s: int, n_a: int, action_variance: float = ACTION_VARIANCE, **options: Any
+) -> ResidualLearner:
+    """The learner of :meth:`EnhancedModel.for_grasp`."""
+    return _ON_A_HAND(n_s + n_a, N_OUT, kernel=grasp_kernel(n_s, n_a, action_variance), **options)
+
+
+def _rbf(n_s: int, n_a: int, **options: Any) -> ResidualLearner:
+    """Takes up the dead zone, too: smooth over 15 cm and 4.5 rad of the state and 8 deg of an actuator."""
+    lengthscale = torch.tensor([15.0] * n_s + [4.0] * n_a, dtype=torch.float64)
+    kernel = residual.SquaredExponential(n_s + n_a, lengthscale=lengthscale, variance=4.0)
+    return _ON_A_HAND(n_s + n_a, N_OUT, kernel=kernel, **options)
+
+
+def _alone(n_s: int, n_a: int, capacity: int) -> ResidualLearner:
+    return residual.ZeroResidual(n_s + n_a, N_OUT, noise_variance=NOISE_VARIANCE)
+
+
+_ON_A_HAND = _sparse(robust=3.0, forgetting_factor=0.995)
+#: What demo and experiments take if nobody names another.
+DEFAULT_LEARNER = "action-linear"
+#: Learners of a hand: name -> ``factory(n_s, n_a, capacity=..., **options)``.
+HAND_LEARNERS: dict[str, Factory] = {DEFAULT_LEARNER: _action_linear, "rbf": _rbf, "model alone": _alone}
+
+
 def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -> ResidualLearner:
     """A fresh learner of ``[encode(s); da]``.
 
     Args:
         n_s, n_a: features of the state, actuators.
-        capacity: basis vectors or random frequencies; networks and RLS have no such figure.
+        capacity: basis vectors; the model alone has none.
         options: instead of the factory's own choices.
 
     Raises:
-        UnknownNameError: no such learner; the message lists them.
+        UnknownNameError: no such learner of a hand; the message lists them.
     """
-    options = {"capacity": capacity, **_HAND_FIGURES.get(name, {}), **options}
-    return learner_factory(name)(n_s + n_a, N_OUT, n_actions=n_a, **options)
+    if name not in HAND_LEARNERS:
+        raise UnknownNameError("learner", name, HAND_LEARNERS)
+    return HAND_LEARNERS[name](n_s, n_a, capacity=capacity, **options)

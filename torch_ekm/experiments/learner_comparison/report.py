@@ -29,7 +29,7 @@ class ComparisonReport(Comparison):
         return "\n".join([str(self.tables()[0]), *self.verdicts()])
 
     def write(self, folder: str | Path) -> Report:
-        """Tables as CSV, figures as SVG and PNG, and ``index.html`` with all of them, into ``folder``."""
+        """Tables as CSV, figures as SVG, and ``index.html`` with all of them, into ``folder``."""
         save = partial(save_figure, folder=Path(folder))
         caption = (
             "Error over that of the model alone with 95 % intervals, left of 1 a learner helps. Blue: "
@@ -96,18 +96,17 @@ def output_table(comparison: Comparison, stream: str) -> Table:
 
 
 def overview_table(comparison: Comparison) -> Table:
-    """Error over that of the model alone: learners by streams, and the mean rank."""
+    """Error over that of the model alone: learners by streams."""
     names = [stream.name for stream in comparison.streams]
-    ranks = comparison.ranks().mean(0)
-    best = {name: comparison.best(name).learner for name in names}
+    best = [comparison.best(name).learner for name in names]
     rows: list[list[Cell]] = []
-    for learner, rank in sorted(zip(comparison.learners, ranks, strict=True), key=lambda pair: pair[1]):
-        figures = ((comparison.error(name, learner).mean, best[name] == learner) for name in names)
-        cells = (f"{mean:.3f}{' *' if first else ''}" for mean, first in figures)
-        rows.append([learner, *cells, float(rank)])
+    for learner in comparison.learners:
+        means = [f"{comparison.error(name, learner).mean:.3f}" for name in names]
+        rows.append(
+            [learner, *(f"{x} *" if first == learner else x for x, first in zip(means, best, strict=True))]
+        )
     heads = [name + (", median" if comparison.measure(name) == "median" else "") for name in names]
-    columns = ["learner", *heads, Column("mean rank", ".1f")]
-    return Table("overview", "rms error / that of the model alone", columns, rows, "* best.")
+    return Table("overview", "rms error / that of the model alone", ["learner", *heads], rows, "* best.")
 
 
 def curve_learners(comparison: Comparison, stream: str, most: int = 6) -> Sequence[str]:

@@ -50,8 +50,7 @@ def compare(
         data: CSV or Parquet files, recordings of ROS, names of public ones (see ``torch-ekm compare
             --help``), streams; of different names.
         learners: name -> ``factory(in_features, out_features)``, lambdas and classes of a notebook included;
-            or names of the package's own. By default all of these but ``rbf`` and ``action-linear``, which
-            must know which inputs are an action, and those of other libraries.
+            or names of the package's own. By default all of these but those of other libraries.
         targets: columns of the files to predict; ``y``, ``y1``, ``y2``, ..., if none is named. For these 0 is
             the model alone; for others, without ``predicted``, the mean of their first tenth.
         inputs: columns of the files to predict from; all others if none is named.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..._extras import require
 from ...typing import Array, Float, Tensor
 from ..reporting.statistics import Estimate, bootstrap
 from .stream import Stream
@@ -19,7 +17,6 @@ from .stream import Stream
 Measure = Literal["rms", "median"]
 _BLOCKS = 20
 _ABSURD = 100.0  # [nats] of one sample; errors of 14 deviations
-_NAMED = 4  # outputs; more are read in the table
 _DECIDED = 0.5
 """Share of the squared error, made by a hundredth of the samples, above which the rms says little."""
 
@@ -63,15 +60,8 @@ class Comparison:
         That is where a hundredth of the samples makes more than half of the squared error of the learner
         with the smallest.
         """
-        return self._measures[stream]
-
-    @functools.cached_property
-    def _measures(self) -> dict[str, Measure]:
-        found: dict[str, Measure] = {}
-        for stream in self.streams:
-            least = min((self.errors[stream.name, name] for name in self.learners), key=np.sum)
-            found[stream.name] = "median" if rare_share(least) > _DECIDED else "rms"
-        return found
+        least = min((self.errors[stream, name] for name in self.learners), key=np.sum)
+        return "median" if rare_share(least) > _DECIDED else "rms"
 
     def error(self, stream: str, learner: str) -> Estimate:
         """Over that of the model alone, by the stream's :meth:`measure`."""
@@ -103,57 +93,38 @@ class Comparison:
         errors = self.errors[stream, ours], self.errors[stream, theirs]
         return block_bootstrap(*errors, blocks_of(self.stream(stream)), measure=self.measure(stream))
 
-    def ranks(self) -> Array:
-        """``(n_streams, n_learners)``, 1 is best; ties share their mean rank."""
-        table = [[self.error(stream.name, name).mean for name in self.learners] for stream in self.streams]
-        return require("scipy.stats").rankdata(table, axis=1)
-
     def verdicts(self) -> list[str]:
         """For each stream: which learner is best and whether it helps, which others are not distinguishable
         from it, how far off the default is, on how many of how many rows, whether a few of them decide."""
-        sentences = []
-        for stream in self.streams:
-            best = self.best(stream.name).learner
-            ratios = {
-                name: self.ratio(stream.name, name, best)
-                for name in self.learners
-                if name not in (best, "model alone")
-            }
-            level = [name for name, ratio in ratios.items() if ratio.low <= 1]
-            error = self.error(stream.name, best)
-            by = "by the median " if self.measure(stream.name) == "median" else ""
-            if best == "model alone" or error.high < 1:
-                text = f"{stream.name}: {best} is best, {by}{error:.3f} of the model alone"
-            else:
-                text = f"{stream.name}: no learner is distinguished from the model alone. {best} has the"
-                text += f" least error, {by}{error:.3f} of the model's"
-            if level:
-                text += f"; this recording does not distinguish it from {', '.join(level)}"
-            behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)
-            named = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
-            text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in named)
-            text += f". On {stream.used}.{self._in_file_units(stream, best)}"
-            if self.measure(stream.name) == "median":
-                share = 100 * rare_share(self.errors[stream.name, best])
-                text += f" Medians: one row in a hundred makes {share:.0f} % of the squared error."
-            if gives_away(stream):
-                text += " The inputs give y: is what was measured among them?"
-            text += stream.notes
-            if sure := [score.learner for score in self.row(stream.name) if score.nll > _ABSURD]:
-                text += f" Errors far beyond the stated variance (NLL): {', '.join(sure)}."
-            sentences.append(text)
-        return sentences
+        return [self._verdict(stream) for stream in self.streams]
 
-    def _in_file_units(self, stream: Stream, best: str) -> str:
-        """Say what the best learner makes of the model's errors, where a sentence can hold it."""
-        if best == "model alone" or not 0 < len(stream.outputs) <= _NAMED:
-            return ""
-        measure, errors = self.measure(stream.name), self.output_errors(stream.name, best)
-        alone = np.array(stream.unit) * errors_of_outputs(stream.y[stream.warm_up :])[measure]
-        pairs = (
-            f"{name} {e:.3g}, alone {a:.3g}" for name, e, a in zip(stream.outputs, errors, alone, strict=True)
-        )
-        return f" {measure} errors in the units of the file: {'; '.join(pairs)}."
+    def _verdict(self, stream: Stream) -> str:
+        best = self.best(stream.name).learner
+        others = [name for name in self.learners if name not in (best, "model alone")]
+        ratios = {name: self.ratio(stream.name, name, best) for name in others}
+        level = [name for name, ratio in ratios.items() if ratio.low <= 1]
+        error, medians = self.error(stream.name, best), self.measure(stream.name) == "median"
+        by = "by the median " if medians else ""
+        if best == "model alone" or error.high < 1:
+            text = f"{stream.name}: {best} is best, {by}{error:.3f} of the model alone"
+        else:
+            text = f"{stream.name}: no learner is distinguished from the model alone. {best} has the"
+            text += f" least error, {by}{error:.3f} of the model's"
+        if level:
+            text += f"; this recording does not distinguish it from {', '.join(level)}"
+        behind = sorted((n for n in ratios if n not in level), key=lambda n: ratios[n].mean)
+        named = [name for k, name in enumerate(behind) if name == "default" or (k == 0 and not level)]
+        text += "".join(f"; {name} has {ratios[name]:.3f} times its error" for name in named)
+        text += f". On {stream.used}."
+        if medians:
+            share = 100 * rare_share(self.errors[stream.name, best])
+            text += f" Medians: one row in a hundred makes {share:.0f} % of the squared error."
+        if gives_away(stream):
+            text += " The inputs give y: is what was measured among them?"
+        text += stream.notes
+        if sure := [score.learner for score in self.row(stream.name) if score.nll > _ABSURD]:
+            text += f" Errors far beyond the stated variance (NLL): {', '.join(sure)}."
+        return text
 
 
 def errors_of_outputs(error: Float[Tensor, "n m"]) -> dict[Measure, list[float]]:

@@ -19,7 +19,7 @@ from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, FigureFile, Report, Table
 from ..reporting.statistics import DataFrame
-from ..reporting.tables import by_object, group_table
+from ..reporting.tables import error_table
 from ..reporting.trials import select
 from ..runner import Bench, new_objects
 from .generalize import Generalize
@@ -72,9 +72,8 @@ class Demo(Generalize):
         report, turns = super().report(seeds, trials, folder), select(trials, kind="turn")
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
-        shown = ("stop_reasons", "controllers", "prediction")
-        by_angle = group_table(turns, "angle_deg", "each target")
-        leading = [by_angle, *([new_table(trials)] if self.new else [])]
+        shown = ("stop_reasons", "controllers")
+        leading = [error_table(turns, "angle_deg"), *([new_table(trials)] if self.new else [])]
         report.tables = leading + [table for table in report.tables if table.name in shown]
         report.leading = len(leading)
         report.figures = [*self._pictures(turns, folder), *self._motions(turns, folder), *report.figures]
@@ -139,7 +138,8 @@ def new_table(trials: DataFrame) -> Table:
         for name in ("KM", "E-KM")
     }
     note = "One seed: means of the turns. The E-KM has learned the hand with the first object."
-    items = by_object(select(trials, kind="new"))
+    made = select(trials, kind="new")
+    items = {str(name): mine for name, mine in made.groupby("object", sort=False)} | {"all": made}
     return Table.of("new_objects", "Objects that the hand has never held", "object", items, columns, note)
 
 

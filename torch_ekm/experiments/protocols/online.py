@@ -104,7 +104,6 @@ class Online(Protocol):
         shown = [
             self.paper_table(trials),
             tables.reason_table(trials),
-            tables.prediction_table(trials),
             tables.controller_table(trials),
         ]
         what = f"{self.trials} turns of the {object_name(self.object)} for each seed and controller."
@@ -131,7 +130,7 @@ class Online(Protocol):
             found = learned[name].dropna().to_numpy()
             rows.append([what, paper, bootstrap_mean(found) if len(found) else None, len(found)])
         hands = [(ekm.loc[seed].dropna(), km.loc[seed].dropna()) for seed in ekm.index]
-        rows += [[*row, len(ekm)] for row in tables.p_rows(hands, *tables.prediction_means(trials), "< 0.05")]
+        rows.append([*tables.p_row(hands, "< 0.05"), len(ekm)])
         columns = ["figure", "paper", Column("here, mean over seeds", ".2f"), "seeds"]
         note = (
             "Means over the seeds that have one. After how many trials the E-KM predicts better for good (1: "

@@ -1,4 +1,4 @@
-"""Figures: one function each, colour-blind-safe, from the frame of the trials; saved as SVG and PNG."""
+"""Figures: one function each, colour-blind-safe, from the frame of the trials; saved as SVG."""
 
 from __future__ import annotations
 
@@ -35,13 +35,12 @@ def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, sha
 
 
 def save_figure(figure: Figure, folder: Path, name: str, caption: str = "") -> FigureFile:
-    """Write ``name.svg`` and ``name.png`` into ``folder``, which is made if it is not there."""
+    """Write ``name.svg`` into ``folder``, which is made if it is not there."""
     make_folder(folder)
     # the same figure gives the same files: identifiers of an SVG would be drawn at random, and dated
     style = require("matplotlib.style").context(STYLE)
     with told_as_output_error(folder / f"{name}.svg"), style:
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
-        figure.savefig(folder / f"{name}.png", dpi=150)
     return FigureFile(f"{name}.svg", caption)
 
 

@@ -6,7 +6,6 @@ import csv
 import html
 import json
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,16 +14,14 @@ from typing import Any, TypeVar
 from ..._extras import require
 from ..._files import make_folder, told_as_output_error
 from ..._versions import versions_of
-from .statistics import Estimate, Rate
+from .statistics import Estimate
 
 _PACKAGES = (
     "torch_ekm", "torch", "numpy", "scipy", "sapien", "coal", "qpsolvers", "piqp", "pytorch-kinematics",
 )  # fmt: skip
-#: A number with its interval or its unit, or both.
-_FIGURE = re.compile(r"[-+]?\d[\d.e+-]*(?: \[[^\]]*\]| (?=%|deg\b|mm\b))(?: ?(?:%|deg\b|mm\b))?")
 T = TypeVar("T")
 #: None: there is nothing to say.
-Cell = str | bool | int | float | Estimate | Rate | None
+Cell = str | bool | int | float | Estimate | None
 
 
 @dataclass(frozen=True)
@@ -166,15 +163,8 @@ class Report:
 
     def _render(self, kind: str, **given: Any) -> str:
         environment = require("jinja2").Environment(autoescape=kind == "html", keep_trailing_newline=True)
-        environment.filters["unbroken"] = unbroken
         template = (Path(__file__).parent / "templates" / f"report.{kind}").read_text(encoding="utf-8")
         return environment.from_string(template).render({**vars(self), **given})
-
-
-def unbroken(text: str) -> Any:
-    """HTML of a text whose figures keep their interval and unit on one line."""
-    kept = _FIGURE.sub(r'<span class="figure">\g<0></span>', html.escape(str(text)))
-    return require("jinja2.utils").markupsafe.Markup(kept)
 
 
 def versions() -> dict[str, str]:

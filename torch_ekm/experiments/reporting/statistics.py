@@ -93,37 +93,11 @@ def estimate(trials: DataFrame, column: str) -> Estimate | None:
     return bootstrap_mean(means) if means.size else None
 
 
-@dataclass(frozen=True)
-class Rate:
-    """``count / n`` with Wilson's 95 % interval."""
-
-    count: int
-    n: int
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.count}/{self.n} [{100 * self.low:.0f}, {100 * self.high:.0f}] %"
-
-
-def rate(events: Iterable[bool]) -> Rate:
-    """How often something happened, with Wilson's 95 % interval (``scipy.stats.binomtest``)."""
+def rate(events: Iterable[bool]) -> str:
+    """How often something happened, ``count/n``, with Wilson's 95 % interval (``scipy.stats.binomtest``)."""
     outcomes = list(events)
-    if not outcomes:
-        return Rate(0, 0, 0.0, 1.0)
-    count = int(sum(outcomes))
-    interval = require("scipy.stats").binomtest(count, len(outcomes)).proportion_ci(method="wilson")
-    return Rate(count, len(outcomes), float(interval.low), float(interval.high))
-
-
-def paired_p(ours: Array, theirs: Array) -> float | None:
-    """p of the two-sided paired t-test (``scipy.stats.ttest_rel``); None: fewer than two."""
-    if len(ours) < 2:
-        return None
-    difference = ours - theirs
-    if np.ptp(difference) == 0:  # a t-test of a constant is undefined; say what it means
-        return float(difference[0] == 0)
-    return float(require("scipy.stats").ttest_rel(ours, theirs).pvalue)
+    interval = require("scipy.stats").binomtest(sum(outcomes), len(outcomes)).proportion_ci(method="wilson")
+    return f"{sum(outcomes)}/{len(outcomes)} [{100 * interval.low:.0f}, {100 * interval.high:.0f}] %"
 
 
 @dataclass(frozen=True)

@@ -25,30 +25,12 @@ LEGEND = {
     "E-KM": "the same servo inverse; the model follows the figures of the hand, which it learns, and a "
     "learner corrects it; it plans whole turns, and goes as far at once as it is sure",
 }
-_MEANINGS = {
-    StopReason.REACHED.value: "the measured error stays within the tolerance",
-    StopReason.STALLED.value: "the error falls no further",
-    StopReason.STEP_LIMIT.value: "all motions are used up",
-    StopReason.ACTUATOR_LIMITS.value: "the motors that are needed are at the ends of their ranges",
-    StopReason.UNSTABLE_GRASP.value: "the model predicts that the grasp buckles, or cannot be held",
-    StopReason.GIVEN_UP.value: "no way on was safe; the object is in the hand",
-    StopReason.WEAK_GRASP.value: "declined: a finger bore less than the object needs",
-    StopReason.OUT_OF_REACH.value: "declined before anything moved",
-    StopReason.OBJECT_LOST.value: "the object was dropped, or turned too far off the axis",
-    StopReason.FORCE_CEILING.value: "a fingertip pressed harder than the guard allows",
-    NOT_GRASPED: "no pinch held the object",
-}
 
 
 def by_controller(trials: DataFrame) -> dict[str, DataFrame]:
     """The turns of each controller that has any."""
     found = {name: select(trials, controller=name, kind="turn") for name in CONTROLLERS}
     return {name: mine for name, mine in found.items() if len(mine)}
-
-
-def by_object(trials: DataFrame) -> dict[str, DataFrame]:
-    """Trials of each object, and of all."""
-    return {str(name): mine for name, mine in trials.groupby("object", sort=False)} | {"all": trials}
 
 
 def legend(trials: DataFrame) -> dict[str, str]:
@@ -64,49 +46,43 @@ def controller_table(trials: DataFrame) -> Table:
         Column("motions", ".1f"): lambda mine: stats.estimate(mine, "motions"),
         Column("first motion [deg]"): lambda mine: stats.estimate(mine, "first_step_deg"),
         Column("reached"): lambda mine: stats.rate(mine["reason"] == _REACHED),
-        Column("not reached"): lambda mine: stats.rate(mine["not_reached"]),
         Column("lost"): lambda mine: stats.rate(mine["lost"]),
+        Column("KM, one motion [deg]"): lambda mine: stats.estimate(mine, "prediction_km"),
+        Column("E-KM, one motion [deg]"): lambda mine: stats.estimate(mine, "prediction_ekm"),
     }
     note = (
         "Mean and 95 % bootstrap interval over pairs of object and seed; steady-state errors by the "
         "simulation's truth. A lost object counts with the whole angle of the target. First motion: by how "
-        "much more or less it changed the error than it was to. Not reached: the object is in the hand, but "
-        "not at its target. Intervals of rates are Wilson's."
+        "much more or less it changed the error than it was to. Intervals of rates are Wilson's. One motion: "
+        "how far KM and E-KM mispredict what was measured of a motion, before the learner trains on it."
     )
     items = by_controller(trials)
     return Table.of("controllers", "All turns of each controller", "controller", items, columns, note)
 
 
-def group_table(trials: DataFrame, by: str, what: str) -> Table:
-    """Steady-state errors and ends of the turns by the entries of a column, the E-KM's paired with the KM's.
-
-    Args:
-        by: "object" (the paper's Table II), "angle_deg".
-        what: the groups in words.
-    """
-    names, rows = list(by_controller(trials)), []
-    turns = trials[trials["kind"] == "turn"]
-    tested = trials["seed"].nunique() >= LEAST_SEEDS
+def pivot(turns: DataFrame, by: str, split: str, cell: Callable[[DataFrame], Cell], what: str) -> Table:
+    """A row for each entry of the column ``split`` and one for all, a column for each of ``by``."""
+    names, rows = list(dict.fromkeys(turns[by])), []
     groups = {
         f"{key:g}" if isinstance(key, float) else str(key): mine
-        for key, mine in turns.groupby(by, sort=False)
+        for key, mine in turns.groupby(split, sort=False)
     }
     for key, mine in {**groups, "all": turns}.items():
-        found = by_controller(mine)
-        errors = [stats.estimate(found[name], "error_deg") if name in found else None for name in names]
-        ends = (f"{name} {of['lost'].sum()}, {of['not_reached'].sum()}" for name, of in found.items())
-        compared = ratio_and_p(*paired(mine, "E-KM", "KM"), mine["seed"].nunique())
-        rows.append([key, *errors, *compared[: 1 + tested], "; ".join(ends)])
-    columns = [
-        by.replace("_deg", " [deg]"), *(f"{name} [deg]" for name in names),
-        Column("E-KM:KM [%]", ".0f", percent=True), *([Column("p paired", ".1g")] if tested else []),
-        "lost, not reached",
-    ]  # fmt: skip
-    note = (
-        "Steady-state error, lost objects with the whole angle. Ratio of means with the bootstrap over "
-        "pairs of object and seed."
-    )
-    return Table(f"by_{by.removesuffix('_deg')}", f"Steady-state error of {what}", columns, rows, note)
+        found = dict(tuple(mine.groupby(by)))
+        rows.append([key, len(mine), *(cell(found[name]) if name in found else None for name in names)])
+    name, columns = split.removesuffix("_deg"), [split.replace("_deg", " [deg]"), "turns", *names]
+    return Table(f"by_{name}", f"Each {name}: {what}", columns, rows)
+
+
+def error_table(trials: DataFrame, split: str) -> Table:
+    """Steady-state errors and ends of the turns by the entries of a column, such as "object"."""
+
+    def cell(turns: DataFrame) -> str:
+        error = stats.estimate(turns, "error_deg")
+        return f"{error:.2f}; {turns['lost'].sum()}, {turns['not_reached'].sum()}"
+
+    what = "steady-state error [deg], lost objects with the whole angle; turns lost, and not reached"
+    return pivot(select(trials, kind="turn"), "controller", split, cell, what)
 
 
 def reason_table(trials: DataFrame) -> Table:
@@ -121,68 +97,23 @@ def reason_table(trials: DataFrame) -> Table:
         count, mean = mine.size(), mine.mean()
         errors = {name: "" if np.isnan(mean[name]) else f" ({mean[name]:.2f})" for name in count.index}
         cells = [f"{count[name]}{errors[name]}" if name in errors else "-" for name in names]
-        rows.append([reason, *cells, _MEANINGS.get(reason, "a guard stopped it")])
-    columns = ["reason", *(f"{name}: turns (error [deg])" for name in names), "what it means"]
+        rows.append([reason, *cells])
+    columns = ["reason", *(f"{name}: turns (error [deg])" for name in names)]
     note = "Turns, and in brackets the mean true error at their end; none of lost objects."
     return Table("stop_reasons", "Why the turns ended", columns, rows, note)
 
 
-def paired(trials: DataFrame, ours: str, theirs: str) -> tuple[Array, Array]:
-    """Unit means of the steady-state errors of two controllers, for the units that both have."""
-    mine, others = (select(trials, controller=name, kind="turn") for name in (ours, theirs))
-    return stats.paired_means(mine, others, "error_deg")
+def ratio(trials: DataFrame, theirs: str) -> Estimate | None:
+    """Mean error of the E-KM over that of another controller, on the units that both have."""
+    mine, other = (select(trials, controller=name, kind="turn") for name in ("E-KM", theirs))
+    ours, others = stats.paired_means(mine, other, "error_deg")
+    return stats.bootstrap_ratio(ours, others) if len(ours) and others.mean() else None
 
 
-def ratio_and_p(ours: Array, theirs: Array, n_seeds: int) -> tuple[Estimate | None, float | None]:
-    """Ratio of means, and p of the paired t-test, where there are such and enough seeds."""
-    if not len(ours) or theirs.mean() == 0:
-        return None, None
-    p = stats.paired_p(ours, theirs) if n_seeds >= LEAST_SEEDS else None
-    return stats.bootstrap_ratio(ours, theirs), p
-
-
-def p_rows(hands: Sequence[tuple[Array, Array]], ours: Array, theirs: Array, paper: str) -> list[list[Cell]]:
-    """p of the paper's two-sided test of two samples, on each hand alone, and of the paired one on all."""
+def p_row(hands: Sequence[tuple[Array, Array]], paper: str) -> list[Cell]:
+    """p of the paper's two-sided test of two samples on each hand alone: the median."""
     each = [require("scipy.stats").ttest_ind(*hand).pvalue for hand in hands if len(hand[0]) > 1]
-    p = stats.paired_p(ours, theirs) if len(hands) >= LEAST_SEEDS else None
-    one, all_hands = f"{np.median(each):.1e}" if each else None, None if p is None else f"{p:.1e}"
-    return [["p of two samples, one hand (median)", paper, one], ["p paired, all hands", None, all_hands]]
-
-
-def prediction_means(trials: DataFrame, kind: str = "") -> tuple[Array, Array]:
-    """Unit means of the one-step prediction errors of E-KM and KM on the E-KM's own motions [deg].
-
-    Args:
-        kind: "true_" for errors against the plant's truth.
-    """
-    mine = select(trials, controller="E-KM", kind="turn").dropna(subset="prediction_ekm")
-    return stats.paired_means(mine, mine, f"{kind}prediction_ekm", f"{kind}prediction_km")
-
-
-def prediction_cells(trials: DataFrame, kind: str = "") -> list[Cell]:
-    """KM, E-KM, and their ratio; nothing where no E-KM moved."""
-    ours, theirs = prediction_means(trials, kind)
-    if not len(ours):
-        return [None] * 3
-    return [stats.bootstrap_mean(theirs), stats.bootstrap_mean(ours), stats.bootstrap_ratio(ours, theirs)]
-
-
-def prediction_table(trials: DataFrame) -> Table:
-    """One-step prediction error of KM and E-KM on the E-KM's own motions."""
-    rows = [
-        [name, *prediction_cells(mine), *prediction_cells(mine, "true_")]
-        for name, mine in by_object(trials).items()
-        if len(prediction_means(mine)[0])
-    ]
-    columns: list[Column | str] = ["object"]
-    for what in ("measured", "true"):
-        ratio = Column(f"E-KM:KM, {what} [%]", ".0f", percent=True)
-        columns += [f"KM, {what} [deg]", f"E-KM, {what} [deg]", ratio]
-    note = (
-        "Mean |M_c (ds - prediction)| [deg], the prediction made before the learner trains on the motion. "
-        "'Measured' includes the camera's noise, which no model can predict; 'true' does not."
-    )
-    return Table("prediction", "One-step prediction error", columns, rows, note)
+    return ["p of two samples, one hand (median)", paper, f"{np.median(each):.1e}" if each else None]
 
 
 def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
@@ -201,13 +132,14 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
         parts.append(f"Objects lost, and turns that did not reach the target: {', '.join(failed)}.")
         if 2 * (turns[order[0]]["reason"] == _REACHED).sum() < len(turns[order[0]]):
             parts.append(f"The {order[0]}: {why(turns[order[0]])}")
-    ours, theirs = prediction_means(trials)
-    if len(ours):
-        wrong = f"{stats.bootstrap_mean(ours):.2f} deg, the KM to {stats.bootstrap_mean(theirs):.2f} deg"
-        parts.append(f"The E-KM predicts one motion to {wrong} on the same motions.")
+    ours, theirs = (
+        stats.estimate(turns.get("E-KM", trials[:0]), f"prediction_{name}") for name in ("ekm", "km")
+    )
+    if ours is not None:
+        parts.append(f"The E-KM predicts one motion to {ours:.2f} deg, the KM to {theirs:.2f} deg.")
     if len(seeds) >= LEAST_SEEDS and order[:1] == ["E-KM"]:
-        found = {name: ratio_and_p(*paired(trials, "E-KM", name), 0)[0] for name in order[1:]}
-        ratios = [f"{name} {100 * ratio:.0f} %" for name, ratio in found.items() if ratio is not None]
+        found = {name: ratio(trials, name) for name in order[1:]}
+        ratios = [f"{name} {100 * one:.0f} %" for name, one in found.items() if one is not None]
         if ratios:
             parts.append(f"Error of the E-KM over that of {', '.join(ratios)} (paired).")
     for name, mine in trials[trials["kind"] == "turn"].groupby("object", sort=False):
