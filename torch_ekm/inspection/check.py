@@ -23,10 +23,11 @@ from ..kinematics import ActuationMap, HandKinematics, LinkPoses
 from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
 from ..rendering import make_scene, save_picture
 from ..simulation import PlantConfig, SimulatedHand, preset
-from ..simulation.grasp_planning.doctor import Cure, smallest_changes
-from ..simulation.grasp_planning.pinch import pinch_problem
-from ..simulation.grasp_planning.pinch_problem import PinchGeometry
+from ..simulation.grasp_planning.blame import BorneProblem
+from ..simulation.grasp_planning.pinch import pinch_problem, solve
+from ..simulation.grasp_planning.pinch_problem import PinchGeometry, PinchRequest
 from ..simulation.grasp_planning.requirements import direction_unmet, unmet
+from ..simulation.grasp_planning.trials import smallest_changes
 from ..simulation.parameters import PlantParameters
 from ..simulation.physics.links import x_axis_to
 from ..typing import Array
@@ -212,20 +213,18 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
 
 
 def _cured(hand: HandDescription, obj: ObjectDescription, picture: Path | None) -> Iterator[Check]:
-    """The smallest changes with which the planner finds a pinch; the picture shows the one that fails."""
-    cure = smallest_changes(hand, obj, PlantConfig(), PlantParameters())
-    yield _changes(cure)
+    """Changes with which the planner finds a pinch; the picture shows the one that fails."""
+    if changes := smallest_changes(hand, obj, PlantConfig(), PlantParameters()):
+        found = f"the pinch holds with {'; or '.join(changes)}"
+        yield Check("smallest change", "warning", found, "any of these")
+    else:
+        found = "none found: no single change makes the pinch hold"
+        yield Check("smallest change", "warning", found, "another object, or several changes at once")
     if picture is not None:
         with contextlib.suppress(EKMError, OSError):  # a row says so
-            _draw(hand, None, picture, obj, cure.failed)
-
-
-def _changes(cure: Cure) -> Check:
-    if not cure.changes:
-        found = "none found: no single figure makes the pinch hold, or not within the time for the search"
-        return Check("smallest change", "warning", found, "another object, or several figures at once")
-    found = f"the pinch holds with {'; or '.join(cure.changes)}"
-    return Check("smallest change", "warning", found, "any of these")
+            borne = BorneProblem(pinch_problem(hand, obj, PlantConfig(), PlantParameters()))
+            failed = borne.geometry(solve(borne, PinchRequest(hand.pinch_force)).x[None])
+            _draw(hand, None, picture, obj, failed)
 
 
 def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
@@ -279,8 +278,8 @@ def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]
     if failures:
         remedy = "a smaller 'pinch_force' in [hand], stiffer springs, more friction"
         if isinstance(failures[0], EquilibriumError):
-            cure = smallest_changes(hand, obj, PlantConfig(), preset("nominal"))
-            remedy = "; or ".join(cure.changes) or remedy
+            changes = smallest_changes(hand, obj, PlantConfig(), preset("nominal"))
+            remedy = "; or ".join(changes) or remedy
         yield Check("pinch, preset nominal", "warning", f"{found}; {failures[0]}", remedy)
     else:
         yield Check("pinch, preset nominal", "ok", found)

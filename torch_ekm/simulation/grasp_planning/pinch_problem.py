@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -158,17 +157,6 @@ class PinchProblem:
         self.in_use: NDArray[np.bool_] = np.abs(J_a @ self.follow).max(axis=1, initial=0.0) > _PULLS
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)
         self._rest()
-
-    def changed(
-        self, hand: HandDescription, obj: ObjectDescription, transmission: Transmission
-    ) -> PinchProblem:
-        """The same pinch with other figures: links, pads and what moves are the same."""
-        new = copy.copy(self)
-        new.hand, new.obj, new.transmission = hand, obj, transmission
-        new.joint_range = (hand.joint_lower[self.moving], hand.joint_upper[self.moving])
-        new._prepare_mechanism()
-        new.preferred = new._half_bent()
-        return new
 
     def _with_loops(self, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """These joints, and those that move with them through loops."""
@@ -362,14 +350,14 @@ class PinchProblem:
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
-        load = self.joint_load(g)
+        load = self._joint_load(g)
         if self._constant:
             return load @ self._to_tension.T
         return self._reactions(g, load)[0][:, : self.hand.n_a]
 
     def _unheld(self, g: PinchGeometry) -> Array:
         """What of the joint load neither actuators nor loops nor couplings bear ``(batch, n_q)`` [N m]."""
-        load = self.joint_load(g)
+        load = self._joint_load(g)
         if self._constant:
             return load  # the passive motions are at right angles to all that is borne
         found, rows = self._reactions(g, load)
@@ -380,10 +368,6 @@ class PinchProblem:
         off = np.zeros_like(g.torque)
         off[:, self.moving] = self._unheld(g)[:, self.moving] @ self._passive @ self._passive.T
         return off
-
-    def passive_share(self, joint: int) -> float:
-        """How much of a torque at one joint nothing bears, 0 to 1."""
-        return float(np.square(self._passive[self.moving == joint]).sum())
 
     def slack(self, g: PinchGeometry) -> list[str]:
         """Tendons that would have to push, by name."""
@@ -400,7 +384,7 @@ class PinchProblem:
         found = np.linalg.pinv(rows.swapaxes(-1, -2), rcond=1e-9) @ (load @ self._free)[..., None]
         return found[..., 0], rows
 
-    def joint_load(self, g: PinchGeometry) -> Array:
+    def _joint_load(self, g: PinchGeometry) -> Array:
         """What springs and contacts ask of the tendons, for moment arms J_a, ``(batch, n_q)`` [N m]."""
         T = self.transmission
         inner = g.q + T.lean(g.torque)
