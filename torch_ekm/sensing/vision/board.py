@@ -96,6 +96,7 @@ class MarkerBoard:
             corners[k, :, :2] = upper_left + square
         return corners
 
+    @cached_property
     def texture(self) -> NDArray[np.uint8]:
         """The printed card: 0 black, 255 white, texels of about 0.25 mm, upper left first.
 
