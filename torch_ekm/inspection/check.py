@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -30,7 +29,6 @@ from ..simulation.grasp_planning.requirements import direction_unmet, unmet
 from ..simulation.grasp_planning.trials import smallest_changes
 from ..simulation.parameters import PlantParameters
 from ..simulation.physics.links import x_axis_to
-from ..typing import Array
 from .row import Check, State
 
 _SURFACE = 2e-4  # [m] between a pad and its link's collision shape, and of an object from its grasp_width
@@ -158,32 +156,25 @@ def _tensions(hand: HandDescription) -> Iterator[Check]:
     lower, upper = hand.actuator_lower, hand.actuator_upper
     a = lower + _FRACTIONS[:, None] * (upper - lower)
     anywhere = np.full(hand.n_q, np.inf)  # stops oppose every tendon
-    rods = tuple(dataclasses.replace(one, tendon=False) for one in hand.actuators)  # below 0: slack
-    free = dataclasses.replace(hand, joint_lower=-anywhere, joint_upper=anywhere, actuators=rods)
+    rods = tuple(replace(one, tendon=False) for one in hand.actuators)  # below 0: slack
+    free = replace(hand, joint_lower=-anywhere, joint_upper=anywhere, actuators=rods)
     tension = ActuationMap(free).pull(torch.from_numpy(a)).numpy()
     for k, actuator in enumerate(hand.actuators):
         if not actuator.tendon:
             continue
-        name, remedy = (
-            f"tendon '{actuator.name}'",
-            "check its springs' stiffness and rest angles, and its range",
-        )
+        name, remedy = f"tendon '{actuator.name}'", "check its springs' stiffness, rest angles, and range"
         most = tension[:, k].max()
         if most <= _TAUT:
             yield Check(name, "error", "slack over its whole range: no spring opposes it", remedy)
         else:
-            first = _first_taut(tension[:, k])
+            i = int(np.argmax(tension[:, k] > _TAUT))
+            ends = slice(i - 1, i + 1)  # between two of them it becomes taut
+            first = float(np.interp(_TAUT, tension[ends, k], _FRACTIONS[ends])) if i else 0.0
             at = f"{np.degrees(lower[k] + first * (upper[k] - lower[k])):.0f} deg"
             rest = "slack at rest, " if first > _LEAST_SLACK else ""
             state: State = "warning" if first > 0.5 else "ok"
             found = f"{rest}taut from {at}, up to {most:.2g} N m in free motion"
             yield Check(name, state, found, remedy if state == "warning" else "")
-
-
-def _first_taut(tension: Array) -> float:
-    """The part of the range from which a tendon that becomes taut is so."""
-    k = int(np.argmax(tension > _TAUT))
-    return float(np.interp(_TAUT, tension[k - 1 : k + 1], _FRACTIONS[k - 1 : k + 1])) if k else 0.0
 
 
 def _rigid(hand: HandDescription) -> Iterator[Check]:

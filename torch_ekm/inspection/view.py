@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -79,8 +78,7 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
 
 def view_hand(hand: HandDescription) -> View:
     """Where the hand rests that touches nothing, while each actuator closes and opens."""
-    upper = np.array([part.upper for part in hand.actuators])
-    start = np.clip(0.0, [part.lower for part in hand.actuators], upper)
+    upper, start = hand.actuator_upper, np.clip(0.0, hand.actuator_lower, hand.actuator_upper)
     ways = np.r_[np.linspace(0, 1, _FRAMES), np.linspace(1, 0, _FRAMES)]
     postures = [start, *(start + way * np.diag(upper - start)[i] for i in range(hand.n_a) for way in ways)]
     q = ActuationMap(hand).joints(torch.from_numpy(np.array(postures))).numpy()
@@ -107,12 +105,8 @@ def _grasp(plant: SimulatedHand, seen: Observation) -> View:
         lost = ", lost" if way[-1].status is PlantStatus.LOST else ""
         rows.append((name + lost, *_moved(start, _truth(way[-1]), axis), _forces(hand, way[-1])))
         plant.restore(grasp)
-    header = (
-        f"actuator, {_STEPS * math.degrees(_STEP):g} deg",
-        "turned about its axis [deg]",
-        "moved [mm]",
-        "forces [N]",
-    )
+    by = f"actuator, {_STEPS * math.degrees(_STEP):g} deg"
+    header = (by, "turned about its axis [deg]", "moved [mm]", "forces [N]")
     states = [_truth(one) for one in shown]
     captions = Captions(
         f"{hand.name} holds {plant.object.name}",
@@ -130,38 +124,29 @@ def _reach(plant: SimulatedHand) -> View:
     back, forth = (loop.reach(sign=sign) for sign in (-1, 1))
     there = [_along(reach) for reach in (forth, back)]
     shown = [*there[0], *reversed(there[0][:-1]), *there[1][1:], *reversed(there[1][:-1])]
-    states = [one.state for one in shown]
+    states, lines, std, forces = (list(part) for part in zip(*shown, strict=True))
     captions = Captions(
         f"{plant.hand.name} turns {plant.object.name}: the plan both ways, with two standard deviations",
-        tuple(one.line for one in shown),
+        tuple(lines),
         _turned(states, plant.rotation_axis),
-        np.array([one.std for one in shown]),
-        forces=_forces_on(plant.hand, states, [one.force for one in shown]),
+        np.array(std),
+        forces=_forces_on(plant.hand, states, forces),
     )
     rows = tuple(row for name, end in (("back", back), ("forth", forth)) for row in _way(name, end))
     header = ("direction", "angle [deg]", "off the axis [deg]", "ends by")
     return View(_scene(plant, states), captions, header, rows)
 
 
-class _Waypoint(NamedTuple):
-    """What a page shows of one."""
-
-    state: GraspState
-    line: str
-    std: float
-    """Of the turn [deg]."""
-    force: Tensor | None
-
-
-def _along(reach: Reach) -> list[_Waypoint]:
-    """From the grasp to the last waypoint."""
-    plan, found = reach.plan, [_Waypoint(reach.plan.start, "at rest", 0.0, None)]
+def _along(reach: Reach) -> list[tuple[GraspState, str, float, Tensor | None]]:
+    """From the grasp to the last waypoint: its line, deviation of the turn [deg], and forces."""
+    plan = reach.plan
+    found: list[tuple[GraspState, str, float, Tensor | None]] = [(plan.start, "at rest", 0.0, None)]
     for k, one in enumerate(plan.waypoints, 1):
         safe = "" if k <= plan.safe else ", not safe"
         end = f"; ends by {reach.end}" if k == len(plan.waypoints) else ""
         std = float((plan.focus.matrix[0].square() * one.band.twist_std.square()).sum().sqrt())
         line = f"waypoint {k}: {one.band}{safe}{end}"
-        found.append(_Waypoint(one.state, line, math.degrees(std), one.band.force))
+        found.append((one.state, line, math.degrees(std), one.band.force))
     return found
 
 

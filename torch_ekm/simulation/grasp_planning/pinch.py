@@ -161,7 +161,7 @@ def pinch_hint(problem: PinchProblem) -> str:
 
 
 def _blame(problem: PinchProblem, request: PinchRequest) -> str:
-    """Whether geometry or torque is to blame, with figures."""
+    """Geometry or torque, with figures."""
     reach = solve(BorneProblem(problem), request)
     if not reach.holds:
         return blame_geometry(problem, problem.geometry(reach.x[None]))

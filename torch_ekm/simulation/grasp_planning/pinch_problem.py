@@ -132,7 +132,10 @@ class PinchProblem:
         """Of the object, as columns: long axis, grasp axis, their product."""
         self.preferred = self._half_bent()
         """Half-bent fingers: most at the last joint, which the pinch force bends anyway."""
-        self.towards = self._direction_of_grasp()
+        tips = self.tips(self.preferred)
+        across = tips[1:].mean(axis=0) - tips[0]
+        across -= self.along * (self.along @ across)
+        self.towards: Array = across / np.linalg.norm(across)
         self._third = np.cross(self.along, self.towards)
         # long axis along the hand's wanted direction, grasp axis from the thumb to the fingers
         self._nominal = np.column_stack([self.along, self.towards, self._third]) @ self.axes.T
@@ -181,29 +184,16 @@ class PinchProblem:
         """The nearest positions in the motors' ranges."""
         return np.clip(motor, self.hand.actuator_lower, self.hand.actuator_upper)
 
-    def _unpack(self, x: Array) -> tuple[Array, Array, Array]:
-        n = len(self.moving)
-        rotation = exp(torch.from_numpy(x[:, n + 3 : n + 6])).numpy() @ self._nominal
-        return self.posture(x[:, :n]), x[:, n : n + 3], rotation
-
-    def _direction_of_grasp(self) -> Array:
-        tips = self.tips(self.preferred)
-        across = tips[1:].mean(axis=0) - tips[0]
-        across -= self.along * (self.along @ across)
-        return across / np.linalg.norm(across)
-
     def tips(self, moving: Array) -> Array:
         """Centres of the pads' rounded ends ``(*batch, c, 3)`` [m]."""
         poses = self._pad_poses(moving)
         return np.einsum("...cij,cj->...ci", poses[..., :3, :3], self._tip) + poses[..., :3, 3]
 
-    def directions(self, moving: Array) -> Array:
-        """Outward directions of the pads' middles, hand frame ``(*batch, c, 3)``."""
-        return np.einsum("...cij,cj->...ci", self._pad_poses(moving)[..., :3, :3], self._palmar)
-
     def opposition(self, moving: Array) -> tuple[Array, Array]:
         """How well the pads face each other, cosines ``(b, c)``, and their distance ``(b,)`` [m]."""
-        facing, distance = opposition(self.tips(moving), self.directions(moving))
+        turns = self._pad_poses(moving)[..., :3, :3]
+        directions = np.einsum("...cij,cj->...ci", turns, self._palmar)
+        facing, distance = opposition(self.tips(moving), directions)
         return facing, distance - self._radius[0] - self._radius[1:].mean()
 
     def _pad_poses(self, moving: Array) -> Array:
@@ -242,7 +232,9 @@ class PinchProblem:
         own = np.append((x[:-1, :placed] != x[-1, :placed]).any(axis=1), True)
         rows = np.flatnonzero(own)
         place = np.where(own, np.cumsum(own) - 1, len(rows) - 1)
-        q, o, R = self._unpack(x[rows])
+        n = len(self.moving)
+        q, o = self.posture(x[rows, :n]), x[rows, n : n + 3]
+        R = exp(torch.from_numpy(x[rows, n + 3 : placed])).numpy() @ self._nominal
         poses = self.kinematics(torch.from_numpy(q))
         transforms = poses.transforms.numpy()
         links = transforms[:, self._links]
@@ -315,8 +307,8 @@ class PinchProblem:
             for part in (at[:, 0], at[:, 1:].mean(axis=1))
         ]
         long_axis = g.rotation @ self.axes[:, 0]
-        wish = self._tilted(request)
-        tilt = (long_axis - wish) / 0.1
+        wish = self.along + request.tilt[0] * self._third + request.tilt[1] * self.towards
+        tilt = (long_axis - wish / np.linalg.norm(wish)) / 0.1
         facing = np.concatenate([-g.facing[:, :1], g.facing[:, 1:]], axis=1)
         opposed = np.maximum(0.0, 0.98 - facing) / 0.05
         clear = np.maximum(0.0, _CLEAR - g.clearance) / 1e-3
@@ -389,10 +381,6 @@ class PinchProblem:
         T = self.transmission
         inner = g.q + T.lean(g.torque)
         return (T.spring_torque(inner) + g.torque) / T.shape.arm(inner)
-
-    def _tilted(self, request: PinchRequest) -> Array:
-        wish = self.along + request.tilt[0] * self._third + request.tilt[1] * self.towards
-        return wish / np.linalg.norm(wish)
 
     def jacobian(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
         """Of :meth:`residuals`, central differences, all columns in one batch.
