@@ -176,10 +176,9 @@ class SimulatedHand:
     def observe(self) -> Observation:
         """Read the sensors; their noise is drawn again."""
         rig, draw = self._grasped(), self._generator
-        q, (position, rotation) = rig.scene.q, rig.scene.object_pose
+        _, q, position, rotation = now = rig.state
         status = self.status
-        joints = self._sensors.joints(q, draw)
-        picture = self._sensors.pictured(rig.state)
+        joints, picture = self._sensors.joints(q, draw), self._sensors.pictured(now)
         seen_position, seen_rotation, taken, seen = self._sensors.pose(picture, draw)
         force = self._sensors.forces(rig.normal, rig.time, draw)
         if not seen and status is PlantStatus.HELD:
