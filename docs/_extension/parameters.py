@@ -26,7 +26,7 @@ GROUPS = {
     "Controller: size of a step": ("torch_ekm.control", ["LimitingFunction"]),
     "Plan": ("torch_ekm.control", ["WholeTurn"]),
     "Closed loop": ("torch_ekm.control", ["StoppingRule", "Guards"]),
-    "Simulation": ("torch_ekm.simulation", ["PlantConfig", "ImageQuality"]),
+    "Simulation": ("torch_ekm.simulation", ["PlantConfig"]),
 }
 
 

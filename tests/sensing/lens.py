@@ -21,10 +21,10 @@ def rays(lens: PinholeCamera, pixels: np.ndarray) -> np.ndarray:
     return found.reshape(pixels.shape)
 
 
-def render(lens: PinholeCamera, scene, rng, quality=None) -> np.ndarray:
+def render(lens: PinholeCamera, scene, rng) -> np.ndarray:
     """The picture of an ideal lens, each pixel taken from where its ray meets it."""
     ideal = replace(lens, distortion=(0.0,) * 5)
-    image = SimulatedCamera(ideal, quality).render(scene, rng)
+    image = SimulatedCamera(ideal).render(scene, rng)
     if not any(lens.distortion):
         return image
     v, u = np.mgrid[: lens.height, : lens.width]

@@ -88,7 +88,7 @@ def test_scene_is_the_grasp_seen_from_the_camera(hand, obj):
 
 def test_camera_faces_both_cards(obj, pose_of):
     palm, other = ICUB_PALM_MOUNT, pose_of(0.02, 0.04, 0.06, 70, 30, 10) @ np.diag([1.0, -1, -1, 1])
-    pose = GraspView.facing(palm, other, 0.4)
+    pose = GraspView.facing(palm, other)
     middle = (palm[:3, 3] + other[:3, 3]) / 2
     np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)

@@ -103,7 +103,7 @@ def test_a_finger_over_one_corner_does_not_matter(pose_of, simulated, rng):
     scene = scene_of(pose_of)
     target = scene.cards[1]
     tip = target.outline[0] * 0.85
-    finger = ConvexBody.capsule(tip, tip - np.array([0.0, 0.06, 0.0]), 0.006)
+    finger = ConvexBody(np.stack([tip, tip - [0.0, 0.06, 0.0]]), np.full(2, 0.006))
     tracker = MarkerTracker(simulated.camera, PALM, OBJECT)
     track = tracker.track(simulated.render(dataclasses.replace(scene, bodies=(finger,)), rng))
     assert track.ok

@@ -11,7 +11,8 @@ from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
 from torch_ekm.sensing.vision import board_pose
 from torch_ekm.sensing.vision.board_pose import estimate_board_pose, projection_jacobian
-from torch_ekm.simulation import ImageQuality, SimulatedCamera
+from torch_ekm.simulation import SimulatedCamera
+from torch_ekm.simulation.imaging import simulated_camera
 from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard
 
 LENSES = [PinholeCamera(), PinholeCamera(fx=580, cx=300, distortion=(-0.15, 0.1, 1e-3, -5e-4, 0.0))]
@@ -72,9 +73,11 @@ def test_prior_decides_between_mirror_images(pose_of, rng, monkeypatch):
 
 
 @pytest.mark.parametrize("camera", LENSES)
-def test_edges_correct_rough_corners(pose_of, camera, rng):
+def test_edges_correct_rough_corners(pose_of, camera, rng, monkeypatch):
+    monkeypatch.setattr(simulated_camera, "_NOISE", 1.0)
+    monkeypatch.setattr(simulated_camera, "_VIGNETTE", 0.0)
     board, pose = MarkerBoard(), pose_of(0.03, 0.02, tilt_deg=30)
-    image = render(camera, CardScene((PlacedCard(board, pose),)), rng, ImageQuality(noise=1.0, vignette=0.0))
+    image = render(camera, CardScene((PlacedCard(board, pose),)), rng)
     rough = {k: u + 0.3 * rng.standard_normal((4, 2)) for k, u in corners(board, pose, camera).items()}
     found = estimate_board_pose(image, camera, board, rough)
     error = twist(found.rotation, found.position, pose)
@@ -86,7 +89,8 @@ def test_edges_correct_rough_corners(pose_of, camera, rng):
 @pytest.mark.parametrize("shade", [40, 215])
 def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
-    finger = ConvexBody.capsule(np.array([-0.03, 0.012, 0.33]), np.array([0.04, 0.02, 0.33]), 0.007, shade)
+    ends = np.array([[-0.03, 0.012, 0.33], [0.04, 0.02, 0.33]])
+    finger = ConvexBody(ends, np.full(2, 0.007), shade)
     image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, pose),), (finger,)), rng)
     found = estimate_board_pose(image, camera, board, corners(board, pose, camera))
     error = twist(found.rotation, found.position, pose)

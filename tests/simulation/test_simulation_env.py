@@ -101,7 +101,6 @@ def test_forty_steps_are_the_end():
     [
         ({"render_mode": "human"}, ParameterError),
         ({"parameters": "nasty"}, UnknownNameError),
-        ({"step_limit": -1.0}, ParameterError),
         ({"angles": (5.0, 25.0)}, ParameterError),  # degrees
         ({"angles": 0.2}, ParameterError),
         ({"angles": (0.4, 0.1)}, ParameterError),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,13 +22,14 @@ from ..kinematics import ActuationMap, HandKinematics, LinkPoses
 from ..model import KinematicModel, Linearization, ModelOptions, ModelStatus
 from ..rendering import make_scene, save_picture
 from ..simulation import PlantConfig, SimulatedHand, preset
-from ..simulation.grasp_planning.doctor import Cure, smallest_changes
-from ..simulation.grasp_planning.pinch import pinch_problem
-from ..simulation.grasp_planning.pinch_problem import PinchGeometry
+from ..simulation.grasp_planning.blame import BorneProblem
+from ..simulation.grasp_planning.pinch import pinch_problem, solve
+from ..simulation.grasp_planning.pinch_problem import PinchGeometry, PinchRequest
 from ..simulation.grasp_planning.requirements import direction_unmet, unmet
+from ..simulation.grasp_planning.trials import smallest_changes
+from ..simulation.mechanism.assembly import true_hand
 from ..simulation.parameters import PlantParameters
 from ..simulation.physics.links import x_axis_to
-from ..typing import Array
 from .row import Check, State
 
 _SURFACE = 2e-4  # [m] between a pad and its link's collision shape, and of an object from its grasp_width
@@ -75,15 +75,11 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     rows += [*_width(obj), *_rigid(description), *_reach(description, obj)]
     unfit = any(row.state == "error" for row in rows)
     pinch = list(_pinch(description, obj, picture, PlantConfig()))
-    faulty = any(row.state == "error" for row in pinch)
-    if faulty:
+    if any(row.state == "error" for row in pinch):
         if not unfit and (other := [row.name for row in pads if row.state != "ok"]):
             remedy = f"first paste the shapes of {', '.join(other)} as printed above"
             found = "parts of the hand other than the pads touch the object"
             return [*rows, Check("collision shapes", "error", found, remedy), *pinch]
-        if wrong := [row.name for row in pads if row.state == "error"]:
-            first = f"first correct {', '.join(wrong)}"
-            pinch = [row._replace(remedy=first) if row.state == "error" else row for row in pinch]
         if unfit:  # no other figure cures a fault of the files
             return [*rows, *pinch]
         unplanned = any(row.name == _UNPLANNED for row in pinch)
@@ -163,21 +159,20 @@ def _tensions(hand: HandDescription) -> Iterator[Check]:
     lower, upper = hand.actuator_lower, hand.actuator_upper
     a = lower + _FRACTIONS[:, None] * (upper - lower)
     anywhere = np.full(hand.n_q, np.inf)  # stops oppose every tendon
-    rods = tuple(dataclasses.replace(one, tendon=False) for one in hand.actuators)  # below 0: slack
-    free = dataclasses.replace(hand, joint_lower=-anywhere, joint_upper=anywhere, actuators=rods)
+    rods = tuple(replace(one, tendon=False) for one in hand.actuators)  # below 0: slack
+    free = replace(hand, joint_lower=-anywhere, joint_upper=anywhere, actuators=rods)
     tension = ActuationMap(free).pull(torch.from_numpy(a)).numpy()
     for k, actuator in enumerate(hand.actuators):
         if not actuator.tendon:
             continue
-        name, remedy = (
-            f"tendon '{actuator.name}'",
-            "check its springs' stiffness and rest angles, and its range",
-        )
+        name, remedy = f"tendon '{actuator.name}'", "check its springs' stiffness, rest angles, and range"
         most = tension[:, k].max()
         if most <= _TAUT:
             yield Check(name, "error", "slack over its whole range: no spring opposes it", remedy)
         else:
-            first = _first_taut(tension[:, k])
+            i = int(np.argmax(tension[:, k] > _TAUT))
+            ends = slice(i - 1, i + 1)  # between two of them it becomes taut
+            first = float(np.interp(_TAUT, tension[ends, k], _FRACTIONS[ends])) if i else 0.0
             at = f"{np.degrees(lower[k] + first * (upper[k] - lower[k])):.0f} deg"
             rest = "slack at rest, " if first > _LEAST_SLACK else ""
             state: State = "warning" if first > 0.5 else "ok"
@@ -185,18 +180,8 @@ def _tensions(hand: HandDescription) -> Iterator[Check]:
             yield Check(name, state, found, remedy if state == "warning" else "")
 
 
-def _first_taut(tension: Array) -> float:
-    """The part of the range from which a tendon that becomes taut is so."""
-    k = int(np.argmax(tension > _TAUT))
-    return float(np.interp(_TAUT, tension[k - 1 : k + 1], _FRACTIONS[k - 1 : k + 1])) if k else 0.0
-
-
 def _rigid(hand: HandDescription) -> Iterator[Check]:
-    try:
-        true = SimulatedHand(hand).true_descriptions()[0]
-    except EKMError:
-        return  # the same error is the pinch's
-    pairs = zip(hand.actuators, true.actuators, strict=True)
+    pairs = zip(hand.actuators, true_hand(hand, PlantParameters()).actuators, strict=True)
     capped = [f"{was.name} {now.stiffness:g}" for was, now in pairs if was.stiffness != now.stiffness]
     found = f"rigid, in simulation [N m/rad]: {', '.join(capped)}" if capped else "of finite stiffness"
     yield Check("actuators", "ok", found)
@@ -218,33 +203,29 @@ def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
 
 
 def _cured(hand: HandDescription, obj: ObjectDescription, picture: Path | None) -> Iterator[Check]:
-    """The smallest changes with which the planner finds a pinch; the picture shows the one that fails."""
-    cure = smallest_changes(hand, obj, PlantConfig(), PlantParameters())
-    yield _changes(cure)
+    """Changes with which the planner finds a pinch; the picture shows the one that fails."""
+    if changes := smallest_changes(hand, obj, PlantConfig(), PlantParameters()):
+        found = f"the pinch holds with {'; or '.join(changes)}"
+        yield Check("smallest change", "warning", found, "any of these")
+    else:
+        found = "none found: no single change makes the pinch hold"
+        yield Check("smallest change", "warning", found, "another object, or several changes at once")
     if picture is not None:
         with contextlib.suppress(EKMError, OSError):  # a row says so
-            _draw(hand, None, picture, obj, cure.failed)
-
-
-def _changes(cure: Cure) -> Check:
-    if not cure.changes:
-        found = "none found: no single figure makes the pinch hold, or not within the time for the search"
-        return Check("smallest change", "warning", found, "another object, or several figures at once")
-    found = f"the pinch holds with {'; or '.join(cure.changes)}"
-    return Check("smallest change", "warning", found, "any of these")
+            borne = BorneProblem(pinch_problem(hand, obj, PlantConfig(), PlantParameters()))
+            failed = borne.geometry(solve(borne, PinchRequest(hand.pinch_force)).x[None])
+            _draw(hand, None, picture, obj, failed)
 
 
 def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """A pinch that is planned and yet not held may be so with a smaller force."""
-    smaller = [force for force in _GENTLER if force < hand.pinch_force]
-    for force in smaller:
-        if not any(row.state == "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))):
+    for force in _GENTLER:
+        if force < hand.pinch_force and all(
+            row.state != "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))
+        ):
             remedy = f"write pinch_force = {force:g} under [hand], or stiffer springs"
             yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", remedy)
             return
-    if smaller:
-        tried = ", ".join(f"{force:g}" for force in smaller)
-        yield Check("pinch force", "ok", f"not what is wrong: no sound pinch with {tried} N either")
 
 
 def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
@@ -285,8 +266,8 @@ def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]
     if failures:
         remedy = "a smaller 'pinch_force' in [hand], stiffer springs, more friction"
         if isinstance(failures[0], EquilibriumError):
-            cure = smallest_changes(hand, obj, PlantConfig(), preset("nominal"))
-            remedy = "; or ".join(cure.changes) or remedy
+            changes = smallest_changes(hand, obj, PlantConfig(), preset("nominal"))
+            remedy = "; or ".join(changes) or remedy
         yield Check("pinch, preset nominal", "warning", f"{found}; {failures[0]}", remedy)
     else:
         yield Check("pinch, preset nominal", "ok", found)
@@ -323,19 +304,17 @@ def _pinch(
 
 def _lost(plant: SimulatedHand) -> str:
     """What was left of the last pinch that did not hold, once the object was let go."""
-    seen = plant.observe()
-    assert seen.truth is not None
-    assert seen.truth.fingertip_force is not None
-    away = float(np.linalg.norm(seen.truth.position.numpy() - plant.plan.position))
-    named = zip(plant.hand.pads, seen.truth.fingertip_force.tolist(), strict=True)
+    seen = plant.observe()  # as it is: the sensors have no noise
+    assert seen.fingertip_force is not None
+    away = float(np.linalg.norm(seen.position.numpy() - plant.plan.position))
+    named = zip(plant.hand.pads, seen.fingertip_force.tolist(), strict=True)
     forces = ", ".join(f"{pad.name} {force:.1f}" for pad, force in named if pad.name in plant.plan.pads)
     return f"; {seen.time:.1f} s after closing: forces [N] {forces}, the object {1e3 * away:.0f} mm off"
 
 
 def _sides(hand: HandDescription, contacts: ContactSet, poses: LinkPoses) -> Iterator[Check]:
-    pads = {pad.name: pad for pad in hand.pads}
     for finger, normal in zip(contacts.finger, contacts.normal.numpy(), strict=True):
-        pad = pads[finger]
+        pad = next(pad for pad in hand.pads if pad.name == finger)
         if float(normal @ poses.of(pad.link)[:3, :3].numpy() @ pad.direction) > 0:
             remedy = f"'direction' of pad '{finger}', or the limits of its joints"
             yield Check("contact sides", "error", f"'{finger}' touches with its back", remedy)
@@ -383,11 +362,11 @@ def _draw(
 ) -> Path:
     """The hand with a rod along each pad's direction and the axes of each contact frame; or a pinch that
     fails, its object seen through."""
-    q, place = torch.from_numpy(hand.spring_rest.clip(hand.joint_lower, hand.joint_upper)), (None, None)
-    if lin is not None:
-        q = lin.state.q
     if failed is not None:
         q, place = torch.from_numpy(failed.q[0]), (failed.position, failed.rotation)
+    else:
+        rest = torch.from_numpy(hand.spring_rest.clip(hand.joint_lower, hand.joint_upper))
+        q, place = rest if lin is None else lin.state.q, (None, None)
     scene = make_scene(hand, obj, q[None].numpy(), *place, np.array(hand.gravity))
     scene = replace(scene, ghosts=0 if obj is None else len(obj.shapes))
     poses, rods = HandKinematics(hand)(q), []

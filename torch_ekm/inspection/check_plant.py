@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..description import HandDescription, ObjectDescription
-from ..drivers import Channel, Wiring
+from ..drivers import Wiring
 from ..exceptions import EKMError, GraspError
 from ..kinematics import ActuationMap, HandKinematics
 from ..model import KinematicModel
@@ -59,7 +59,8 @@ def check_plant(
 
 class _Checked:
     def __init__(self, plant: Plant, hand: HandDescription, obj: ObjectDescription | None) -> None:
-        self.plant, self.hand, self.object = plant, hand, obj
+        self.plant, self.hand = plant, hand
+        self.model = None if obj is None else KinematicModel(hand, obj)
         self._gate = Gate(plant, hand)
         self.wiring: Wiring | None = getattr(plant, "wiring", None)
         middle = torch.from_numpy((hand.actuator_lower + hand.actuator_upper) / 2)
@@ -78,7 +79,7 @@ class _Checked:
         yield self._dtype(seen)
         sensed = seen.info.get("sensed", self.hand.joint_names)
         self.sensed = np.array([name in sensed for name in self.hand.joint_names])
-        self.test = WiringTest(self.hand, self.sensed, self._channel)
+        self.test = WiringTest(self.hand, self.sensed, self.wiring)
         a, q = self._mean()
         readings = Readings(a, q)
         if (self.test.misfit(readings) > _FITS).any():
@@ -88,12 +89,11 @@ class _Checked:
             return
         yield from self._place(seen)
         blind = [n for n, found in zip(self.hand.actuator_names, self.test.rows, strict=True) if not found]
-        watched = self.object is not None and seen.status is PlantStatus.HELD  # the object shows the signs
+        watched = self.model is not None and seen.status is PlantStatus.HELD  # the object shows the signs
         if blind and not watched:
+            found = f"not checked: no sensors at the joints of {', '.join(blind)}"
             remedy = "look which way each goes, or check_plant(WithPose(...), hand, object) with an object"
-            yield Check(
-                "signs", "warning", f"not checked: no sensors at the joints of {', '.join(blind)}", remedy
-            )
+            yield Check("signs", "warning", found, remedy)
         sensors = f"encoders and {int(self.sensed.sum())} joint sensors agree"
         yield Check("at rest", "ok", sensors if self.sensed.any() else "encoders are within their ranges")
         if getattr(self.plant, "dry_run", False):
@@ -121,9 +121,8 @@ class _Checked:
 
     def _clock(self, seen: Observation) -> Iterator[Check]:
         if not seen.dated:
-            yield Check(
-                "clock", "error", "readings have no date: guards against frozen sensors are off", _CLOCK
-            )
+            found = "readings have no date: guards against frozen sensors are off"
+            yield Check("clock", "error", found, _CLOCK)
         elif seen.time < self.looks[0].time:
             yield Check("clock", "error", "the clock goes back", _CLOCK)
         else:
@@ -142,28 +141,22 @@ class _Checked:
     def _place(self, seen: Observation) -> list[Check]:
         """The object is between the pads."""
         if seen.status is not PlantStatus.HELD:
-            return [
-                Check(
-                    "pose",
-                    "warning",
-                    "the object is not seen: its pose is not checked",
-                    "in Python, check_plant(WithPose(driver, camera), hand, object)",
-                )
-            ]
+            found = "the object is not seen: its pose is not checked"
+            remedy = "in Python, check_plant(WithPose(driver, camera), hand, object)"
+            return [Check("pose", "warning", found, remedy)]
         remedy = "give WithPose(frame=<pose of the camera's frame in the hand frame>), or correct it"
         links = HandKinematics(self.hand)(seen.q.double())
-        points = []
+        away = math.inf
         for pad in self.hand.pads:
             pose, middle = links.of(pad.link), (np.array(pad.start) + pad.end) / 2
-            points.append(pose[:3, :3] @ torch.from_numpy(middle) + pose[:3, 3])
-        points = torch.stack(points)
-        away = float(torch.linalg.vector_norm(points - seen.position.double(), dim=-1).min())
+            point = pose[:3, :3] @ torch.from_numpy(middle) + pose[:3, 3]
+            away = min(away, float((point - seen.position.double()).norm()))
         if away > _FAR:
             found = (
                 f"the object is {1e3 * away:.0f} mm away from the nearest pad: the pose is in another frame"
             )
             return [Check("pose", "error", f"{found}, or in mm", remedy)]
-        if self.object is None:
+        if self.model is None:
             found = f"{1e3 * away:.0f} mm from the nearest pad; contacts are not checked: no object is given"
             return [Check("pose", "ok", found)]
         try:
@@ -171,11 +164,6 @@ class _Checked:
         except GraspError as error:
             return [Check("pose", "error", f"no grasp at this pose: {error}", remedy)]
         return [Check("pose", "ok", "pads touch the object where the pose has it")]
-
-    @property
-    def model(self) -> KinematicModel:
-        assert self.object is not None
-        return KinematicModel(self.hand, self.object)
 
     # -- motions ------------------------------------------------------------------------------------
 
@@ -194,7 +182,7 @@ class _Checked:
     def _motions(self, seen: Observation) -> tuple[tuple[Motion, ...], list[Check]]:
         motions, rows, jacobian = [], [], None
         held = seen.status is PlantStatus.HELD
-        if held and self.object is not None:
+        if held and self.model is not None:
             with contextlib.suppress(GraspError):  # said already
                 lin = self.model.linearize(_double(seen).state)
                 eye = torch.eye(self.hand.n_a, dtype=torch.float64)
@@ -207,9 +195,7 @@ class _Checked:
             try:
                 motion, row, pose = self._motion(i)
             except EKMError as error:
-                rows.append(
-                    Check(f"motor '{actuator.name}'", "error", str(error), self._remedy("motors", i, ""))
-                )
+                rows.append(self._wrong(i, str(error), ""))
                 break
             rows += [row] if row is not None else []
             if motion is None:
@@ -248,8 +234,7 @@ class _Checked:
         """The smallest motion of a motor that shows, and back; what is wrong at once."""
         before = self._look()
         a0, q0 = self._mean()
-        name, sign = f"motor '{self.hand.actuator_names[i]}'", self._sign(i, a0[i])
-        delta = torch.zeros(self.hand.n_a, dtype=torch.float64)
+        sign, delta = self._sign(i, a0[i]), torch.zeros(self.hand.n_a, dtype=torch.float64)
         for step in _STEPS:
             delta[i] = sign * step
             self._gate.command(delta, by="check")
@@ -262,36 +247,31 @@ class _Checked:
                 break
         pose = _double(after).state.minus(_double(before).state)[-6:].numpy()
         went, others = motion.a[i] * sign, np.where(np.arange(len(a0)) == i, 0, np.abs(motion.a))
-        k, row = int(np.argmax(others)), None
+        k, kept, found, key = int(np.argmax(others)), motion, "", ""
+        gone = f"its encoder went {went / _DEG:.3g} deg where {step / _DEG:.3g} deg were commanded"
         if others[k] > max(_MOVED, abs(went)):
-            found = f"encoder '{self.hand.actuator_names[k]}' moves in its place: two motors are swapped"
-            row = Check(name, "error", found, self._remedy("motors", i, "id"))
+            other = self.hand.actuator_names[k]
+            found, key = f"encoder '{other}' moves in its place: two motors are swapped", "id"
         elif went < -_STANDS:
-            found = f"its encoder went {went / _DEG:.3g} deg where {step / _DEG:.3g} deg were commanded"
-            found += ": the sign of commands or of the encoder is wrong"
-            row = Check(name, "error", found, self._remedy("motors", i, "sign"))
+            found, key = f"{gone}: the sign of commands or of the encoder is wrong", "sign"
         elif went > 3 * step + _MOVED:
-            found = f"its encoder went {went / _DEG:.3g} deg where {step / _DEG:.3g} deg were commanded"
-            row = Check(
-                name, "error", f"{found}: commands have another unit", self._remedy("motors", i, "per_rad")
-            )
+            found, key = f"{gone}: commands have another unit", "per_rad"
         elif went < _STANDS:
             moved = np.abs(self.hand.actuation_jacobian[i] @ motion.q) > _MOVED and self.test.rows[i]
             found = "its encoder stands still while its joints move" if moved else "it does not move"
-            row = Check(name, "error", f"{found} (4 deg commanded)", self._remedy("motors", i, "id"))
-            return None, row, pose
-        if row is None:
-            delta[i] = -motion.a[i]
-            self._gate.command(delta, by="check")
-        return motion, row, pose
+            found, key = f"{found} (4 deg commanded)", "id"
+            kept = None
+        if found:
+            return kept, self._wrong(i, found, key), pose
+        delta[i] = -motion.a[i]
+        self._gate.command(delta, by="check")
+        return motion, None, pose
 
     def _by_pose(self, i: int, predicted: Array, pose: Array) -> list[Check]:
         """Where no joint sensor shows a motor's sign, the object does."""
         if self.test.rows[i] or self._cosine(predicted, pose) > -0.5:
             return []
-        found = "the object moves against what the model predicts: sign reversed"
-        name = f"motor '{self.hand.actuator_names[i]}'"
-        return [Check(name, "error", found, self._remedy("motors", i, "sign"))]
+        return [self._wrong(i, "the object moves against what the model predicts: sign reversed", "sign")]
 
     def _frame(self, along: list[tuple[Array, Array]]) -> list[Check]:
         predicted, pose = (np.concatenate(list(part)) for part in zip(*along, strict=True))
@@ -333,11 +313,8 @@ class _Checked:
             name, what = mistakes[0].where, mistakes[0].what
             if len(mistakes) > 1:
                 name, what = "wiring", "; ".join(f"{one.where}: {one.what}" for one in mistakes)
-            remedies = [self._remedy(one.kind, k, one.key) for one in mistakes for k in self._places(one)]
+            remedies = [self._remedy(one.kind, n, one.key) for one in mistakes for n in one.names]
             yield Check(name, "error", f"{'or instead: ' if number else ''}{what}", "; ".join(remedies))
-
-    def _places(self, mistake: Mistake) -> list[int]:
-        return [getattr(self.hand, _NAMES[mistake.kind]).index(name) for name in mistake.names]
 
     def _fitting(self, candidates: Iterable[tuple[Mistake, ...]]) -> list[tuple[float, tuple[Mistake, ...]]]:
         """Those without which all readings fit, with their sums of squares, the best first."""
@@ -352,14 +329,10 @@ class _Checked:
     def _unexplained(self, readings: Readings) -> Check:
         off = readings.a - self.hand.unloaded(readings.q)
         i = int(np.argmax(np.where(self.test.rows, np.abs(off), 0)))
-        name = self.hand.actuator_names[i]
         found = (
             f"its encoder and the sensors of its joints differ by {off[i] / _DEG:.3g} deg, or move otherwise"
         )
-        remedy = (
-            self._remedy("motors", i, "zero") + ", or the zeros of its joints; several entries may be wrong"
-        )
-        return Check(f"motor '{name}'", "error", found, remedy)
+        return self._wrong(i, found, "zero", ", or the zeros of its joints; several entries may be wrong")
 
     def _constant(self, motions: tuple[Motion, ...]) -> Iterator[Check]:
         """Joint sensors that read the same, bit by bit, while motors moved: left out from here on."""
@@ -370,9 +343,10 @@ class _Checked:
         dead = (read == read[0]).all(0).numpy() & self.sensed & (moves > _STANDS)
         for j in np.flatnonzero(dead):
             found = "its sensor reads the same, bit by bit, while its motor moves"
-            remedy = self._remedy("joints", int(j), "id") + ", or its cable"
-            yield Check(f"joint '{self.hand.joint_names[j]}'", "error", found, remedy)
-        self.test = WiringTest(self.hand, self.sensed & ~dead, self._channel)
+            name = self.hand.joint_names[j]
+            remedy = self._remedy("joints", name, "id") + ", or its cable"
+            yield Check(f"joint '{name}'", "error", found, remedy)
+        self.test = WiringTest(self.hand, self.sensed & ~dead, self.wiring)
 
     # -- inside -------------------------------------------------------------------------------------
 
@@ -386,20 +360,15 @@ class _Checked:
         a, q = (torch.stack([getattr(o, name).double() for o in self._last]).mean(0) for name in "aq")
         return a.numpy(), q.numpy()
 
-    def _channel(self, kind: str, i: int) -> Channel | None:
-        if self.wiring is None:
-            return None
-        name = getattr(self.hand, _NAMES[kind])[i]
-        return next((one for one in getattr(self.wiring, kind) if one.name == name), None)
+    def _wrong(self, i: int, found: str, key: str, more: str = "") -> Check:
+        """Of a motor."""
+        name = self.hand.actuator_names[i]
+        return Check(f"motor '{name}'", "error", found, self._remedy("motors", name, key) + more)
 
-    def _remedy(self, kind: str, i: int, key: str) -> str:
-        name = getattr(self.hand, _NAMES[kind])[i]
+    def _remedy(self, kind: str, name: str, key: str) -> str:
         if self.wiring is None:
             return f"{key or 'wiring'} of '{name}' in the driver"
         return f"{self.wiring.path}:{self.wiring.line(kind, name, key)}: {key or 'wiring'} of '{name}'"
-
-
-_NAMES = {"motors": "actuator_names", "joints": "joint_names"}
 
 
 def _double(seen: Observation) -> Observation:

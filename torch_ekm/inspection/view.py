@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -79,8 +78,7 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
 
 def view_hand(hand: HandDescription) -> View:
     """Where the hand rests that touches nothing, while each actuator closes and opens."""
-    upper = np.array([part.upper for part in hand.actuators])
-    start = np.clip(0.0, [part.lower for part in hand.actuators], upper)
+    upper, start = hand.actuator_upper, np.clip(0.0, hand.actuator_lower, hand.actuator_upper)
     ways = np.r_[np.linspace(0, 1, _FRAMES), np.linspace(1, 0, _FRAMES)]
     postures = [start, *(start + way * np.diag(upper - start)[i] for i in range(hand.n_a) for way in ways)]
     q = ActuationMap(hand).joints(torch.from_numpy(np.array(postures))).numpy()
@@ -107,20 +105,11 @@ def _grasp(plant: SimulatedHand, seen: Observation) -> View:
         lost = ", lost" if way[-1].status is PlantStatus.LOST else ""
         rows.append((name + lost, *_moved(start, _truth(way[-1]), axis), _forces(hand, way[-1])))
         plant.restore(grasp)
-    header = (
-        f"actuator, {_STEPS * math.degrees(_STEP):g} deg",
-        "turned about its axis [deg]",
-        "moved [mm]",
-        "forces [N]",
-    )
-    states = [_truth(one) for one in shown]
-    captions = Captions(
-        f"{hand.name} holds {plant.object.name}",
-        tuple(lines),
-        _turned(states, axis),
-        forces=_forces_on(hand, states, [one.fingertip_force for one in shown]),
-    )
-    return View(_scene(plant, states), captions, header, tuple(rows))
+    by = f"actuator, {_STEPS * math.degrees(_STEP):g} deg"
+    header = (by, "turned about its axis [deg]", "moved [mm]", "forces [N]")
+    states, forces = [_truth(one) for one in shown], [one.fingertip_force for one in shown]
+    title = f"{hand.name} holds {plant.object.name}"
+    return _held(plant, states, forces, Captions(title, tuple(lines)), header, tuple(rows))
 
 
 def _reach(plant: SimulatedHand) -> View:
@@ -128,51 +117,35 @@ def _reach(plant: SimulatedHand) -> View:
     controller = LookAndMoveController(KinematicModel(plant.hand, plant.object), plant.rotation_axis)
     loop = ClosedLoop(plant, controller)
     back, forth = (loop.reach(sign=sign) for sign in (-1, 1))
-    there = [_along(reach) for reach in (forth, back)]
+    there, rows = [], []
+    for name, reach in (("forth", forth), ("back", back)):
+        way, figures = _along(reach)
+        there.append(way)
+        rows[:0] = [(name, *row) for row in figures]
     shown = [*there[0], *reversed(there[0][:-1]), *there[1][1:], *reversed(there[1][:-1])]
-    states = [one.state for one in shown]
-    captions = Captions(
-        f"{plant.hand.name} turns {plant.object.name}: the plan both ways, with two standard deviations",
-        tuple(one.line for one in shown),
-        _turned(states, plant.rotation_axis),
-        np.array([one.std for one in shown]),
-        forces=_forces_on(plant.hand, states, [one.force for one in shown]),
-    )
-    rows = tuple(row for name, end in (("back", back), ("forth", forth)) for row in _way(name, end))
+    states, lines, std, forces = (list(part) for part in zip(*shown, strict=True))
+    title = f"{plant.hand.name} turns {plant.object.name}: the plan both ways, with two standard deviations"
     header = ("direction", "angle [deg]", "off the axis [deg]", "ends by")
-    return View(_scene(plant, states), captions, header, rows)
+    captions = Captions(title, tuple(lines), std=np.array(std))
+    return _held(plant, states, forces, captions, header, tuple(rows))
 
 
-class _Waypoint(NamedTuple):
-    """What a page shows of one."""
-
-    state: GraspState
-    line: str
-    std: float
-    """Of the turn [deg]."""
-    force: Tensor | None
-
-
-def _along(reach: Reach) -> list[_Waypoint]:
-    """From the grasp to the last waypoint."""
-    plan, found = reach.plan, [_Waypoint(reach.plan.start, "at rest", 0.0, None)]
-    for k, one in enumerate(plan.waypoints, 1):
-        safe = "" if k <= plan.safe else ", not safe"
-        end = f"; ends by {reach.end}" if k == len(plan.waypoints) else ""
-        std = float((plan.focus.matrix[0].square() * one.band.twist_std.square()).sum().sqrt())
-        line = f"waypoint {k}: {one.band}{safe}{end}"
-        found.append(_Waypoint(one.state, line, math.degrees(std), one.band.force))
-    return found
-
-
-def _way(name: str, reach: Reach) -> Iterator[tuple[str, ...]]:
-    """Each waypoint with its band, and what ends the path."""
-    plan = reach.plan
-    asked = plan.errors[0]
+def _along(
+    reach: Reach,
+) -> tuple[list[tuple[GraspState, str, float, Tensor | None]], list[tuple[str, str, str]]]:
+    """From the grasp to the last waypoint: its line, deviation of the turn [deg], and forces; and a row of
+    figures for each waypoint."""
+    plan, rows = reach.plan, []
+    found: list[tuple[GraspState, str, float, Tensor | None]] = [(plan.start, "at rest", 0.0, None)]
     for k, (one, left) in enumerate(zip(plan.waypoints, plan.errors[1:], strict=True), 1):
-        off, std = math.degrees(one.band.off), math.degrees(one.band.off_std)
-        last = str(reach.end) if k == len(plan.waypoints) else "" if k <= plan.safe else "not safe"
-        yield name, f"{math.degrees(asked - left):.1f}", f"{off:.1f} +- {std:.1f}", last
+        safe, ends = k <= plan.safe, k == len(plan.waypoints)
+        std = float((plan.focus.matrix[0].square() * one.band.twist_std.square()).sum().sqrt())
+        line = f"waypoint {k}: {one.band}{'' if safe else ', not safe'}{f'; ends by {reach.end}' * ends}"
+        found.append((one.state, line, math.degrees(std), one.band.force))
+        off = f"{math.degrees(one.band.off):.1f} +- {math.degrees(one.band.off_std):.1f}"
+        last = str(reach.end) if ends else "" if safe else "not safe"
+        rows.append((f"{math.degrees(plan.errors[0] - left):.1f}", off, last))
+    return found, rows
 
 
 def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool = False) -> View:
@@ -237,21 +210,26 @@ def _moments(trajectory: Trajectory, hand: HandDescription) -> list[tuple[str, .
     return rows
 
 
-def _scene(plant: SimulatedHand, states: list[GraspState]) -> Scene:
+def _held(
+    plant: SimulatedHand,
+    states: list[GraspState],
+    forces: list[Tensor | None],
+    captions: Captions,
+    header: tuple[str, ...],
+    rows: tuple[tuple[str, ...], ...],
+) -> View:
     """Seen along the axis about which the object turns."""
-    hand, axis = plant.hand, plant.rotation_axis.numpy()
-    return make_scene(hand, plant.object, *_arrays(states), np.array(hand.gravity), axis=axis)
+    hand, axis = plant.hand, plant.rotation_axis
+    scene = make_scene(hand, plant.object, *_arrays(states), np.array(hand.gravity), axis=axis.numpy())
+    turned = np.array([math.degrees(float(one.minus(states[0])[-3:] @ axis)) for one in states])
+    captions = replace(captions, turned=turned, forces=_forces_on(hand, states, forces))
+    return View(scene, captions, header, rows)
 
 
 def _arrays(states: list[GraspState]) -> tuple[Array, Array, Array]:
     parts = zip(*((s.q.numpy(), s.position.numpy(), s.rotation.numpy()) for s in states), strict=True)
     q, position, rotation = map(np.stack, parts)
     return q, position, rotation
-
-
-def _turned(states: Sequence[GraspState], axis: Tensor) -> Array:
-    """About the axis, from the first one on [deg]."""
-    return np.array([math.degrees(float(one.minus(states[0])[-3:] @ axis)) for one in states])
 
 
 def _forces_on(

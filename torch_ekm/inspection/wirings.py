@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..description import HandDescription
-from ..drivers import Channel
+from ..drivers import Wiring
 from ..typing import Array
 
 _DEG = math.pi / 180
@@ -70,13 +70,13 @@ class WiringTest:
     Args:
         hand: its description.
         sensed: which joints are measured.
-        channels: (kind, index) -> channel, where a wiring file says how raw readings were converted.
+        wiring: how raw readings were converted; None: not known.
     """
 
-    def __init__(
-        self, hand: HandDescription, sensed: NDArray[np.bool_], channels: Callable[[str, int], Channel | None]
-    ) -> None:
-        self.hand, self.sensed, self.channels = hand, sensed, channels
+    def __init__(self, hand: HandDescription, sensed: NDArray[np.bool_], wiring: Wiring | None) -> None:
+        self.hand, self.sensed = hand, sensed
+        kinds = {} if wiring is None else {"motors": wiring.motors, "joints": wiring.joints}
+        self._channels = {(kind, one.name): one for kind, channels in kinds.items() for one in channels}
         self.rows = ~((hand.actuation_jacobian != 0) & ~sensed).any(axis=1)
         """Motors all of whose joints are measured."""
 
@@ -97,24 +97,26 @@ class WiringTest:
 
     def mistakes(self, readings: Readings) -> Iterator[Mistake]:
         """Everything that a single wrong entry could be, with the readings put right."""
-        for kind, names, field in (
-            ("motors", self.hand.actuator_names, "a"),
-            ("joints", self.hand.joint_names, "q"),
+        for kind, names, field, at in (
+            ("motors", self.hand.actuator_names, "a", range(self.hand.n_a)),
+            ("joints", self.hand.joint_names, "q", np.flatnonzero(self.sensed).tolist()),
         ):
-            at = range(len(names)) if kind == "motors" else np.flatnonzero(self.sensed)
-            for i in map(int, at):
-                one = (names[i],)
-                yield Mistake(kind, one, "sign", "sign reversed", _scaled(readings, field, i, -1.0))
-                for factor in (180 / math.pi, math.pi / 180):
-                    what = "unit is degrees, not rad" if factor < 1 else "unit is rad, not degrees"
-                    yield Mistake(kind, one, "per_rad", what, _scaled(readings, field, i, factor))
+            for i in at:
+                only, one = np.arange(len(names)) == i, (names[i],)
+                scales = {
+                    -1.0: ("sign", "sign reversed"),
+                    180 / math.pi: ("per_rad", "unit is rad, not degrees"),
+                    math.pi / 180: ("per_rad", "unit is degrees, not rad"),
+                }
+                for factor, (key, what) in scales.items():
+                    by = np.where(only, factor, 1.0)
+                    yield Mistake(kind, one, key, what, _changed(readings, field, by.__mul__, by.__mul__))
                 for turn in (math.pi, -math.pi):
-                    yield Mistake(kind, one, "zero", _HALF_TURN, _shifted(readings, field, i, turn))
-            for i, k in combinations(map(int, at), 2):
-                both = (names[i], names[k])
-                yield Mistake(
-                    kind, both, "id", "swapped", self._swapped(readings, kind, field, i, k), _TWO_ENTRIES
-                )
+                    shifted = _changed(readings, field, (turn * only).__add__, np.copy)
+                    yield Mistake(kind, one, "zero", _HALF_TURN, shifted)
+            for i, k in combinations(at, 2):
+                swapped = self._swapped(readings, kind, field, names, i, k)
+                yield Mistake(kind, (names[i], names[k]), "id", "swapped", swapped, _TWO_ENTRIES)
 
     def pairs(self, readings: Readings) -> Iterator[tuple[Mistake, Mistake]]:
         """Any two of these; the second has the readings without both."""
@@ -122,39 +124,31 @@ class WiringTest:
             for second in islice(self.mistakes(first.readings), number, None):
                 yield first, second
 
-    def _swapped(self, readings: Readings, kind: str, field: str, i: int, k: int) -> Readings:
+    def _swapped(
+        self, readings: Readings, kind: str, field: str, names: tuple[str, ...], i: int, k: int
+    ) -> Readings:
         """Each channel reads what the other one has read."""
-        one, other = self.channels(kind, i), self.channels(kind, k)
 
         def swap(x: Array, steps: bool) -> Array:
             y = x.copy()
-            if one is None or other is None:
-                y[[i, k]] = x[[k, i]]
-                return y
-            for to, at, channel, source in ((i, k, one, other), (k, i, other, one)):
-                raw = source.bus(float(x[at])) - (source.bus(0.0) if steps else 0.0)
-                y[to] = channel.value(raw + (channel.zero if steps else 0.0))
+            y[[i, k]] = x[[k, i]]
+            one, other = (self._channels.get((kind, names[at])) for at in (i, k))
+            if one is not None and other is not None:
+                for to, at, channel, source in ((i, k, one, other), (k, i, other, one)):
+                    raw = source.bus(float(x[at])) - (source.bus(0.0) if steps else 0.0)
+                    y[to] = channel.value(raw + (channel.zero if steps else 0.0))
             return y
 
-        motions = tuple(replace(m, **{field: swap(getattr(m, field), True)}) for m in readings.motions)
-        return replace(readings, **{field: swap(getattr(readings, field), False)}, motions=motions)
+        return _changed(readings, field, lambda x: swap(x, False), lambda x: swap(x, True))
 
 
 def _off(measured: Array, moved: Array, noise: Array) -> Array:
     return np.abs(measured - _SHARE * moved) / (_LEAST + 2 * noise + _SPREAD * np.abs(moved))
 
 
-def _scaled(readings: Readings, field: str, i: int, factor: float) -> Readings:
-    def scale(x: Array) -> Array:
-        y = x.copy()
-        y[i] *= factor
-        return y
-
-    motions = tuple(replace(m, **{field: scale(getattr(m, field))}) for m in readings.motions)
-    return replace(readings, **{field: scale(getattr(readings, field))}, motions=motions)
-
-
-def _shifted(readings: Readings, field: str, i: int, by: float) -> Readings:
-    value = getattr(readings, field).copy()
-    value[i] += by
-    return replace(readings, **{field: value})
+def _changed(
+    readings: Readings, field: str, rest: Callable[[Array], Array], motion: Callable[[Array], Array]
+) -> Readings:
+    """With one field of the readings at rest, and of each motion, put right."""
+    motions = tuple(replace(one, **{field: motion(getattr(one, field))}) for one in readings.motions)
+    return replace(readings, **{field: rest(getattr(readings, field))}, motions=motions)

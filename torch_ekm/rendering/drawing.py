@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-#: Vertices ``(n, 3)`` [m], faces ``(m, 3)``, colour, opacity (None: it hides what is behind it).
-Drawn = tuple[NDArray[np.float64], NDArray[np.int64], tuple[float, float, float], float | None]
+#: Vertices ``(n, 3)`` [m], faces ``(m, 3)``, colour, opacity.
+Drawn = tuple[NDArray[np.float64], NDArray[np.int64], tuple[float, float, float], float]
 #: Position and focus [m], and up.
 Camera = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 

@@ -39,9 +39,9 @@ class Scene:
     ghosts: int = 0
     """So many of the last shapes are see-through."""
 
-    def opacity(self, shape: int) -> float | None:
-        """Of a shape; None: it hides what is behind it."""
-        return 0.35 if shape >= len(self.shapes) - self.ghosts else None
+    def opacity(self, shape: int) -> float:
+        """Of a shape; 1: it hides what is behind it."""
+        return 0.35 if shape >= len(self.shapes) - self.ghosts else 1.0
 
     @property
     def meshes(self) -> list[Drawn]:
@@ -51,11 +51,11 @@ class Scene:
             MissingExtraError: pyvista or trimesh is not installed.
         """
         require("pyvista")
-        meshes = [(shape_mesh(shape), colour) for shape, colour in self.shapes]
-        return [
-            (np.array(mesh.vertices), np.array(mesh.faces), colour, self.opacity(i))
-            for i, (mesh, colour) in enumerate(meshes)
-        ]
+        meshes = []
+        for i, (shape, colour) in enumerate(self.shapes):
+            mesh = shape_mesh(shape)
+            meshes.append((np.array(mesh.vertices), np.array(mesh.faces), colour, self.opacity(i)))
+        return meshes
 
     @property
     def camera(self) -> tuple[Array, Array, Array]:

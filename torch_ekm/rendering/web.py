@@ -97,8 +97,7 @@ def pad_forces(hand: HandDescription, q: Array, normal: Array) -> Array:
 
 
 def _shape(scene: Scene, i: int, shape: Any, colour: Colour) -> dict[str, Any]:
-    opacity = scene.opacity(i)
-    look = {"colour": colour, "opacity": 1.0 if opacity is None else opacity}
+    look = {"colour": colour, "opacity": scene.opacity(i)}
     if isinstance(shape, Mesh):
         return {**look, "kind": "mesh", "vertices": _packed(shape.vertices), "faces": _packed(shape.faces)}
     return {**look, "kind": shape.kind, "size": list(shape.size)}

@@ -130,18 +130,16 @@ class ContactAligned(PlantWrapper):
                     likely[joint] = -0.5 * float(differs @ torch.linalg.solve(S, differs) + torch.logdet(S))
             if likely:
                 most = max(likely, key=lambda joint: likely[joint])
-                self._warn(pads[pad], most, [j for j in likely if likely[j] > likely[most] - _ALIKE])
+                if most not in self._named:
+                    self._named.add(most)
+                    alike = [j for j in likely if likely[j] > likely[most] - _ALIKE]
+                    names = " or ".join(f"'{self.hand.joint_names[j]}'" for j in alike)
+                    warn(
+                        f"the sensor of joint {names} contradicts pad '{pads[pad]}', which presses; until "
+                        "the next grasp contacts alone say where the joint is: check the sensor"
+                    )
                 return most
         return None
-
-    def _warn(self, pad: str, joint: int, alike: list[int]) -> None:
-        if joint not in self._named:
-            self._named.add(joint)
-            names = " or ".join(f"'{self.hand.joint_names[j]}'" for j in alike)
-            warn(
-                f"the sensor of joint {names} contradicts pad '{pad}', which presses; until the next grasp "
-                "contacts alone say where the joint is: check the sensor"
-            )
 
     def _touching(
         self, seen: Observation, q: Float[Tensor, " n_q"], P: Float[Tensor, "n_q n_q"]

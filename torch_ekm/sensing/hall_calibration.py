@@ -59,21 +59,15 @@ class HallChannel:
         r, c = reading / _FULL_SCALE, self.coefficients
         return c[0] + r * (c[1] + r * (c[2] + r * c[3]))
 
-    @property
-    def unsaturated(self) -> tuple[float, float]:
-        """Angles between which the channel resolves angles [rad], the smaller first."""
-        ends = sorted((self.angle(self.low), self.angle(self.high)))
-        return ends[0], ends[1]
-
     def estimate(self, n: Float[Tensor, "*batch"]) -> tuple[Tensor, ...]:
         """As :class:`HallEstimate`, of this channel's readings; its two bounds one after the other."""
         held = n.clamp(self.low, self.high)  # noise may carry a sound reading past the range of the sweep
         r, c = held / _FULL_SCALE, self.coefficients
-        q, slope = self.angle(held), (c[1] + r * (2 * c[2] + 3 * r * c[3])) / _FULL_SCALE
+        q, slope = self.angle(held), _slope(c, r)
         std = ((slope * self.noise) ** 2 + self.misfit**2).sqrt()
         lower, upper = torch.full_like(q, -torch.inf), torch.full_like(q, torch.inf)
         # the angles that a reading of 0, one of 255, and a stuck channel leave open
-        first, last = self.unsaturated
+        first, last = sorted((self.angle(self.low), self.angle(self.high)))
         ends = [(self.angle_min, first), (last, self.angle_max)]
         if self.angle(self.high) <= self.angle(self.low):
             ends.reverse()
@@ -177,16 +171,20 @@ def _fit(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor, " n"])
     low, high = float(x.min()), float(x.max())
     _check_monotone(name, c, low, high)
     residual = y - V @ c
-    slope = (c[1] + r * (2 * c[2] + 3 * r * c[3])) / _FULL_SCALE
-    noise, misfit = _split(residual, slope)
+    noise, misfit = _split(residual, _slope(c, r))
     c0, c1, c2, c3 = (float(value) for value in c)
     return HallChannel(joint, (c0, c1, c2, c3), low, high, start, end, noise, misfit)
+
+
+def _slope(c: Any, r: Any) -> Any:
+    """``(c_1 + 2 c_2 r + 3 c_3 r^2) / 255`` [rad/count]."""
+    return (c[1] + r * (2 * c[2] + 3 * r * c[3])) / _FULL_SCALE
 
 
 def _check_monotone(name: str, c: Tensor, low: float, high: float) -> None:
     """``q'(r) = c_1 + 2 c_2 r + 3 c_3 r^2`` must not change its sign between the ends."""
     r = torch.linspace(low, high, 512, dtype=torch.float64) / _FULL_SCALE
-    slope = c[1] + r * (2 * c[2] + 3 * r * c[3])
+    slope = _slope(c, r)
     turning = torch.nonzero(torch.sign(slope[1:]) != torch.sign(slope[:-1]))
     if len(turning):
         at = float(r[turning[0, 0]]) * _FULL_SCALE

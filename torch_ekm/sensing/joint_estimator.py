@@ -25,11 +25,6 @@ class JointEstimate(NamedTuple):
     covariance: Float[Tensor, "*batch n_q n_q"]
     """Covariance of their errors [rad^2]."""
 
-    @property
-    def std(self) -> Float[Tensor, "*batch n_q"]:
-        """Standard deviation of each joint angle [rad]."""
-        return self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-
 
 class JointEstimator:
     r"""``min_q sum_k ((q_k - h_k) / s_k)^2 + |(J_a q + a_0 - a) / s_a|^2 + |C (q - q_0) / s_c|^2``.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .config import PlantConfig
 from .disturbances import DisturbedPlant, PlantChange, Tug
 from .hall_sensors import HallSensors
-from .imaging.simulated_camera import ImageQuality, SimulatedCamera
+from .imaging.simulated_camera import SimulatedCamera
 from .parameters import PlantParameters
 from .physics.scene import ENGINES
 from .presets import PRESETS, preset
@@ -17,7 +17,6 @@ __all__ = [
     "PlantChange",
     "DisturbedPlant",
     "HallSensors",
-    "ImageQuality",
     "PlantConfig",
     "PlantParameters",
     "PRESETS",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from .._checks import check_positive
 from ..exceptions import ParameterError
 
 
@@ -39,10 +40,9 @@ class PlantConfig:
     """Commands are increments of the "encoder" or of the "setpoint"."""
 
     def __post_init__(self) -> None:
-        for name in ("time_step", "pinch_force"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
-                raise ParameterError(name, value, "finite and greater than 0")
+        check_positive("time_step", self.time_step)
+        if self.pinch_force is not None:
+            check_positive("pinch_force", self.pinch_force)
         if not 0 <= self.spread <= 1:
             raise ParameterError("spread", self.spread, "between 0 and 1")
         if self.time_step > 0.004:
@@ -50,6 +50,6 @@ class PlantConfig:
         if self.gravity is not None and (len(self.gravity) != 3 or not all(map(math.isfinite, self.gravity))):
             raise ParameterError("gravity", self.gravity, "three finite numbers [m/s^2]")
         if self.along is not None:
-            length = math.sqrt(sum(value * value for value in self.along))
+            length = math.hypot(*self.along)
             if len(self.along) != 3 or not math.isfinite(length) or length < 1e-9:
                 raise ParameterError("along", self.along, "a direction: three finite numbers, not all zero")

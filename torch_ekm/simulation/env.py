@@ -21,7 +21,6 @@ from ..kinematics.se3 import log
 from ..plant import Observation, PlantStatus
 from ..rendering import Picture, make_scene
 from ..typing import Array
-from .config import PlantConfig
 from .parameters import PlantParameters
 from .presets import preset
 from .simulated_hand import SimulatedHand
@@ -67,48 +66,39 @@ class InHandRotation(gymnasium.Env):
     Args:
         hand, object: names, paths or descriptions.
         parameters: plant parameters, or the name of a preset.
-        config: time, gravity, the grasp.
         angles: least and largest target [rad].
-        step_limit: largest increment of an actuator [rad].
         render_mode: None or "rgb_array" (PyVista).
         engine: the physics, as :class:`SimulatedHand` takes it.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 2}
+    step_limit = 3 * _DEG
+    """Largest increment of an actuator [rad]."""
 
     def __init__(
         self,
         hand: HandDescription | str | Path = "icub_right",
         object: ObjectDescription | str | Path = "box",
         parameters: PlantParameters | str = "nominal",
-        config: PlantConfig | None = None,
         angles: tuple[float, float] = (5 * _DEG, 25 * _DEG),
-        step_limit: float = 3 * _DEG,
         render_mode: str | None = None,
         engine: str = "sapien",
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ParameterError("render_mode", render_mode, "None or 'rgb_array'")
-        if not 0 < step_limit < math.pi:
-            raise ParameterError("step_limit", step_limit, "above 0 and below pi [rad]")
         if np.shape(angles) != (2,) or not -math.pi < angles[0] <= angles[1] < math.pi:
             raise ParameterError("angles", angles, "the least and the largest target [rad], below pi")
         if isinstance(parameters, str):
             parameters = preset(parameters)
-        self.plant = SimulatedHand(hand, object, config, parameters, engine=engine)
-        self.angles, self.step_limit = angles, step_limit
-        self.render_mode = render_mode
+        self.plant = SimulatedHand(hand, object, parameters=parameters, engine=engine)
+        self.angles, self.render_mode = angles, render_mode
         self._picture: Picture | None = None
-        description = self.plant.hand
-        n_a = description.n_a
+        n_q, n_a = self.plant.hand.n_q, self.plant.hand.n_a
         bounds = (math.pi, 2 * math.pi, 1.0, math.pi, 100.0, 2 * math.pi)
-        n_pads = len(description.pads) if parameters.force_sensors else 0
-        high = np.repeat(bounds, (description.n_q, n_a, 3, 3, n_pads, 2))
+        n_pads = len(self.plant.hand.pads) if parameters.force_sensors else 0
+        high = np.repeat(bounds, (n_q, n_a, 3, 3, n_pads, 2))
         self.observation_space = gymnasium.spaces.Box(-high, high, dtype=np.float64)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (n_a,), dtype=np.float32)
-        self._start: Observation | None = None
-        self._axis = torch.zeros(3, dtype=torch.float64)
-        self._target = 0.0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -160,8 +150,7 @@ class InHandRotation(gymnasium.Env):
     def _observed(self, observation: Observation) -> tuple[Array, dict[str, Any], float, float]:
         """Observation and info; the angle still to turn about the grasp's axis, and what turned about others
         since the reset [rad]."""
-        assert self._start is not None
-        assert observation.truth is not None
+        assert observation.truth is not None  # the plant is simulated
         self._truth = observation.truth
         rotation = log(observation.rotation @ self._start.rotation.mT)
         turned = float(rotation @ self._axis)
@@ -178,7 +167,7 @@ class InHandRotation(gymnasium.Env):
         info = {
             "is_success": observation.status is not PlantStatus.LOST and abs(to_go) < _TOLERANCE,
             "status": observation.status.value,
-            "truth": {name: value.numpy() for name, value in observation.truth.arrays().items()},
+            "truth": {name: value.numpy() for name, value in self._truth.arrays().items()},
         }
         return np.clip(torch.cat(parts).numpy(), space.low, space.high), info, to_go, off
 

@@ -136,8 +136,6 @@ class PlantParameters:
                 raise ParameterError(name, getattr(self, name), valid)
         if self.force_scale < 1:
             raise ParameterError("force_scale", self.force_scale, "1 or more")
-        if self.frame_loss > 1:
-            raise ParameterError("frame_loss", self.frame_loss, "a chance between 0 and 1")
 
     def replace(self, **changes: object) -> PlantParameters:
         """A copy in which some figures, given by name in their SI units, are changed."""
@@ -156,4 +154,5 @@ _BELOW = {
     "hysteresis": ("between 0 and 1", 1.0),
     "tendon_coupling": ("between 0 and 0.9", 0.9),
     "friction_unevenness": ("between 0 and 0.5", 0.5),
+    "frame_loss": ("a chance between 0 and 1", 1.0),
 }

@@ -23,7 +23,6 @@ from .imaging.grasp_view import GraspView
 from .imaging.simulated_camera import SimulatedCamera
 
 _LOOKS = 5  # pictures tried for one observation
-_DISTANCE = 0.40  # [m] of the camera from the middle between the boards
 
 #: Pose of the palm's marker card in the iCub's palm frame ``(4, 4)`` [m]: its rim clears thumb and knuckles.
 ICUB_PALM_MOUNT = np.array([[1.0, 0, 0, -0.048], [0, 1, 0, 0], [0, 0, 1, 0.004], [0, 0, 0, 1]])
@@ -89,7 +88,7 @@ class SensedPlant(PlantWrapper):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = truth.rotation, truth.position
         palm, board = self.boards
-        camera_pose = GraspView.facing(palm.mount, pose @ board.mount, _DISTANCE)
+        camera_pose = GraspView.facing(palm.mount, pose @ board.mount)
         self._view = GraspView(self.hand, self.object, palm, board, camera_pose)
         self._seed = int(np.random.SeedSequence([0, seed]).generate_state(1)[0])
         self._generator.manual_seed(self._seed)

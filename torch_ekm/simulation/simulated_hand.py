@@ -23,7 +23,7 @@ from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan, exists, pinch_hint, pinch_problem
+from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, solve
 from .grasp_planning.pinch_problem import PinchRequest
 from .grasp_planning.remembered import remembered_pinch
 from .mechanism.assembly import true_hand, true_object
@@ -176,10 +176,9 @@ class SimulatedHand:
     def observe(self) -> Observation:
         """Read the sensors; their noise is drawn again."""
         rig, draw = self._grasped(), self._generator
-        q, (position, rotation) = rig.scene.q, rig.scene.object_pose
+        _, q, position, rotation = now = rig.state
         status = self.status
-        joints = self._sensors.joints(q, draw)
-        picture = self._sensors.pictured(rig.state)
+        joints, picture = self._sensors.joints(q, draw), self._sensors.pictured(now)
         seen_position, seen_rotation, taken, seen = self._sensors.pose(picture, draw)
         force = self._sensors.forces(rig.normal, rig.time, draw)
         if not seen and status is PlantStatus.HELD:
@@ -329,7 +328,7 @@ class SimulatedHand:
 
     def _graspable(self, request: PinchRequest, refused: EquilibriumError) -> bool:
         """Some pinch is known, or the centred one exists; what has none is refused from then on."""
-        if self._plan is None and not exists(self._problem, PinchRequest(request.force)):
+        if self._plan is None and not solve(self._problem, PinchRequest(request.force)).holds:
             self._ungraspable = refused
         return self._ungraspable is None
 

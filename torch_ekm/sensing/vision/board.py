@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from ..._checks import check_positive
 from ..._extras import require
 from ...exceptions import ParameterError, ShapeError, UnknownNameError
 from ...typing import Array
@@ -55,8 +56,7 @@ class MarkerBoard:
 
     def __post_init__(self) -> None:
         for name in ("columns", "rows", "marker_size", "gap", "margin"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(f"MarkerBoard.{name}", getattr(self, name), "positive")
+            check_positive(f"MarkerBoard.{name}", getattr(self, name))
         object.__setattr__(self, "mount", np.array(self.mount, dtype=np.float64))
         if self.mount.shape != (4, 4):
             raise ShapeError("MarkerBoard.mount", "(4, 4)", self.mount.shape)
@@ -96,6 +96,7 @@ class MarkerBoard:
             corners[k, :, :2] = upper_left + square
         return corners
 
+    @cached_property
     def texture(self) -> NDArray[np.uint8]:
         """The printed card: 0 black, 255 white, texels of about 0.25 mm, upper left first.
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..._checks import check_positive
 from ..._extras import require
 from ...exceptions import ParameterError
 from ...typing import Array
@@ -31,8 +32,7 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         for name in ("width", "height", "fx", "fy"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(f"PinholeCamera.{name}", getattr(self, name), "positive [px]")
+            check_positive(f"PinholeCamera.{name}", getattr(self, name))
         if len(self.distortion) != 5:
             raise ParameterError("PinholeCamera.distortion", self.distortion, "(k1, k2, p1, p2, k3)")
 

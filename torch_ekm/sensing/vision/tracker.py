@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -65,26 +67,22 @@ class MarkerTracker:
         grey = self._grey(image)
         markers = self._detect(grey)
         boards = self.palm_board, self.object_board
-        palm, obj = poses = [self._board_pose(board, markers, grey) for board in boards]
-        markers = {k: corners for k, corners in markers.items() if any(k in board.ids for board in boards)}
-
-        def failed(status: TrackStatus) -> Track:
-            return Track(status, palm=palm, object=obj, markers=markers)
-
+        poses = [self._board_pose(board, markers, grey) for board in boards]
+        track = Track(TrackStatus.JUMP, palm=poses[0], object=poses[1], markers=markers)
         seen: list[BoardPose] = []
         hidden = TrackStatus.PALM_HIDDEN, TrackStatus.OBJECT_HIDDEN
         for board, pose, unseen in zip(boards, poses, hidden, strict=True):
             if pose is None:
-                return failed(unseen)
+                return replace(track, status=unseen)
             if pose.ambiguous and id(board) not in self._prior:
-                return failed(TrackStatus.AMBIGUOUS)
+                return replace(track, status=TrackStatus.AMBIGUOUS)
             seen.append(pose)
         position, rotation, covariance = self._object_in_hand(*seen)
         if not self._believable(position, rotation):
-            return failed(TrackStatus.JUMP)
+            return track
         self._prior = {id(board): pose.rotation for board, pose in zip(boards, seen, strict=True)}
-        tensors = (torch.from_numpy(array) for array in (position, rotation, covariance))
-        return Track(TrackStatus.OK, *tensors, palm=palm, object=obj, markers=markers)
+        o, R, P = (torch.from_numpy(array) for array in (position, rotation, covariance))
+        return replace(track, status=TrackStatus.OK, position=o, rotation=R, covariance=P)
 
     def _grey(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         cv2, size = require("cv2"), (self.camera.height, self.camera.width)
@@ -94,12 +92,11 @@ class MarkerTracker:
         return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
 
     def _detect(self, grey: NDArray[np.uint8]) -> dict[int, Array]:
-        """Corners ``(4, 2)`` [px] of each marker number that was found exactly once."""
+        """Corners ``(4, 2)`` [px] of each marker of the boards that was found exactly once."""
         corners, ids, _ = self._detector.detectMarkers(grey)
-        if ids is None:
-            return {}
-        flat = ids.ravel().tolist()
-        once = [(i, k) for i, k in enumerate(flat) if flat.count(k) == 1]
+        flat = [] if ids is None else ids.ravel().tolist()
+        ours = {*self.palm_board.ids, *self.object_board.ids}
+        once = [(i, k) for i, k in enumerate(flat) if k in ours and flat.count(k) == 1]
         return {k: corners[i].reshape(4, 2).astype(np.float64) for i, k in once}
 
     def _board_pose(self, board: MarkerBoard, markers: dict[int, Array], grey: NDArray) -> BoardPose | None:

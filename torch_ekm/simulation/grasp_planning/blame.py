@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from ...typing import Array
+from ..mechanism.assembly import chain
 from .graspable import half_extent
 from .pinch_problem import PinchGeometry, PinchProblem
 
 _INSIDE = 0.5e-3  # [m] of a link in the object
 _APART = 0.2e-3  # [m] between pad and object
-_BENT = 0.05  # [rad] of a joint from its rest, below which no spring helps
 _OFF = 1e-3  # [N m], as the planner's tolerance
 
 
@@ -61,18 +61,17 @@ def blame_torque(problem: PinchProblem, g: PinchGeometry) -> str:
     joint = int(np.abs(off).argmax())
     if abs(off[joint]) > _OFF:
         asked, name = abs(float(g.torque[0, joint])), hand.joint_names[joint]
-        finger = next((pad.name for pad in problem.pads if _moves(problem, joint, pad.link)), "")
+        finger = next((pad.name for pad in problem.pads if joint in chain(hand, pad.link)), "")
         return (
             f"{reach}; torque is to blame: joint '{name}' of finger '{finger}' is "
             f"{1e3 * abs(off[joint]):.1f} mN m out of balance, where the contact asks {1e3 * asked:.1f} mN m"
-            + _would_need(problem, g, joint, float(off[joint]))
         )
     if pushed := problem.slack(g):
         return f"{reach}; torque is to blame: tendon {' and '.join(map(repr, pushed))} would be slack"
     places = zip(hand.actuators, problem.motors(g)[0].tolist(), problem.in_use.tolist(), strict=True)
     if beyond := " and ".join(
-        f"'{one.name}' ({motor_text(one.lower, one.unit)} to {motor_text(one.upper, one.unit)}) "
-        f"at {motor_text(at, one.unit)}"
+        f"'{one.name}' ({_motor_text(one.lower, one.unit)} to {_motor_text(one.upper, one.unit)}) "
+        f"at {_motor_text(at, one.unit)}"
         for one, at, used in places
         if used and not one.lower <= at <= one.upper
     ):
@@ -80,33 +79,6 @@ def blame_torque(problem: PinchProblem, g: PinchGeometry) -> str:
     return f"{reach}; torque is to blame: the joints are in balance only in bad postures"
 
 
-def _would_need(problem: PinchProblem, g: PinchGeometry, joint: int, off: float) -> str:
-    """The spring or the arm with which the joint is in balance as it stands; empty: none does it."""
-    hand, found = problem.hand, []
-    change = -off / problem.passive_share(joint)  # of the torque of this joint alone
-    bent, spring = float(g.q[0, joint] - hand.spring_rest[joint]), float(hand.spring_stiffness[joint])
-    if spring and abs(bent) > _BENT and (stiffer := spring + change / bent) > 0:
-        found.append(f"a spring of {stiffer:.2g} N m/rad, not {spring:.2g}")
-    arms, load = problem.transmission.arms(g.q).reshape(-1, hand.n_q), problem.joint_load(g)[0]
-    pulling = np.flatnonzero(arms[:, joint])
-    others = np.flatnonzero(arms[pulling[0]]) if len(pulling) == 1 else np.zeros(0, int)
-    others = others[others != joint]
-    if len(others):
-        own = arms[pulling[0]]
-        tension = float(own[others] @ load[others] / (own[others] @ own[others]))
-        arm = load[joint] / tension if tension else 0.0
-        if arm * own[joint] > 0:
-            motor = hand.actuators[pulling[0]]
-            way = "below" if abs(arm) < abs(own[joint]) else "above"
-            arm, now = (abs(one) * motor.unit for one in (arm, own[joint]))
-            found.append(f"an arm of '{motor.name}' {way} {arm:.2g}, not {now:.2g}")
-    return f"; it would need {', or '.join(found)}" if found else ""
-
-
-def _moves(problem: PinchProblem, joint: int, link: str) -> bool:
-    return bool(problem.kinematics.upstream[problem.kinematics.link_index(link), joint])
-
-
-def motor_text(at: float, unit: float) -> str:
+def _motor_text(at: float, unit: float) -> str:
     """In the owner's unit: [deg] of motors that count in rad."""
     return f"{np.degrees(at):.0f} deg" if unit == 1 else f"{at * unit:.3g}"

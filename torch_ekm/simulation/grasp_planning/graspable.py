@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ...description import ContactPad, HandDescription, ObjectDescription
-from ...description.shape import Shape
 from ...typing import Array
 
 
@@ -42,24 +41,18 @@ def object_axes(obj: ObjectDescription) -> Array:
     helper = np.eye(3)[np.argmin(np.abs(grasp))]
     first = np.cross(helper, grasp)
     first /= np.linalg.norm(first)
-    extents = {}
-    for axis in (first, np.cross(grasp, first)):
-        extents[half_extent(obj, axis)] = axis
-    long_axis = extents[max(extents)]
+    long_axis = max(np.cross(grasp, first), first, key=lambda axis: half_extent(obj, axis))
     return np.asarray(np.stack([long_axis, grasp, np.cross(long_axis, grasp)], axis=1), dtype=np.float64)
 
 
 def half_extent(obj: ObjectDescription, axis: Array) -> float:
     """How far the object reaches from its origin along a unit vector, in its frame [m]."""
-    return max(_half_extent(shape, axis) for shape in obj.shapes)
-
-
-def _half_extent(shape: Shape, axis: Array) -> float:
-    local = np.abs(shape.transform[:3, :3].T @ axis)
-    centre = abs(float(shape.transform[:3, 3] @ axis))
-    if shape.kind == "box":
-        return centre + float(local @ np.array(shape.size)) / 2
-    if shape.kind == "sphere":
-        return centre + shape.size[0]
-    radius, length = shape.size
-    return centre + float(local[2]) * length / 2 + radius
+    found = 0.0
+    for shape in obj.shapes:
+        local, centre = np.abs(shape.transform[:3, :3].T @ axis), abs(float(shape.transform[:3, 3] @ axis))
+        radius, length = (*shape.size, 0.0)[:2]
+        if shape.kind == "box":
+            found = max(found, centre + float(local @ np.array(shape.size)) / 2)
+        else:
+            found = max(found, centre + float(local[2]) * length / 2 + radius)
+    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -63,6 +63,8 @@ class Solution(NamedTuple):
     outside: float
     """How far a motor is beyond its range [rad]; negative: inside."""
     cost: float
+    facing: float
+    """Least component of a normal along the object's grasp axis."""
 
     def rank(self) -> tuple[bool, bool, float]:
         return self.violation > 1, self.outside > 0, self.cost
@@ -70,6 +72,11 @@ class Solution(NamedTuple):
     @property
     def holds(self) -> bool:
         return self.violation <= 1 and self.outside <= 0 and self.cost <= _BAD_COST
+
+    @property
+    def across(self) -> bool:
+        """The object is held across its grasp axis."""
+        return self.facing >= _FACING
 
     @property
     def good(self) -> bool:
@@ -90,7 +97,7 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
             f"no posture within the limits holds '{problem.obj.name}' with {request.force:g} N",
             pinch_hint(problem) or _blame(problem, request),
         )
-    if not across_axis(problem, found):
+    if not found.across:
         raise EquilibriumError(
             "pinch planner",
             "the only pinch found holds the object across another axis than its 'grasp_axis'",
@@ -110,20 +117,10 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
     )
 
 
-def across_axis(problem: PinchProblem, found: Solution) -> bool:
-    """Whether the object is held across its grasp axis."""
-    return bool(np.abs(problem.geometry(found.x[None]).facing).min() >= _FACING)
-
-
-def exists(problem: PinchProblem, request: PinchRequest) -> bool:
-    """Whether some posture holds the object as wanted."""
-    return solve(problem, request).holds
-
-
-def solve(problem: PinchProblem, request: PinchRequest) -> Solution:
+def solve(problem: PinchProblem, request: PinchRequest, guesses: Iterable[Array] | None = None) -> Solution:
     """The first good solution, or the best from all first guesses."""
-    best = Solution(np.zeros(0), np.inf, np.inf, np.inf)
-    for guess in _guesses(problem, request):
+    best = Solution(np.zeros(0), np.inf, np.inf, np.inf, 0.0)
+    for guess in _guesses(problem, request) if guesses is None else guesses:
         found = descend(problem, request, guess, ranges=False)
         if found.violation <= 1 and found.outside > 0:
             found = descend(problem, request, found.x, ranges=True)
@@ -133,38 +130,16 @@ def solve(problem: PinchProblem, request: PinchRequest) -> Solution:
     return best
 
 
-def descend(
-    problem: PinchProblem, request: PinchRequest, guess: Array, ranges: bool, most: int = _STEPS
-) -> Solution:
+def descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: bool) -> Solution:
     """The nearest minimum to a first guess."""
-    x, cost = minimise(
-        lambda x: problem.residuals(x[None], request, ranges)[0],
-        lambda x: problem.jacobian(x, request, ranges),
-        problem.bounds(),
-        guess,
-        most,
-    )
-    g = problem.geometry(x[None])
-    violation = float(np.abs(problem.equations(request, g)[0]).max())
-    return Solution(x, violation, float(problem.outside(g).max(initial=-np.inf)), cost)
-
-
-def minimise(
-    residuals: Callable[[Array], Array],
-    jacobian: Callable[[Array], Array],
-    bounds: tuple[Array, Array],
-    guess: Array,
-    most: int,
-) -> tuple[Array, float]:
-    """Least squares within bounds, in so many steps at most: where, and half the sum."""
-    low, high = bounds
+    low, high = problem.bounds()
     squares = partial(
         require("scipy.optimize").least_squares,
-        residuals,
-        jac=jacobian,
-        bounds=bounds,
+        lambda x: problem.residuals(x[None], request, ranges)[0],
+        jac=lambda x: problem.jacobian(x, request, ranges),
+        bounds=(low, high),
         x_scale="jac",
-        max_nfev=most,
+        max_nfev=_STEPS,
         ftol=1e-9,
         xtol=1e-9,
         gtol=1e-9,
@@ -176,7 +151,10 @@ def minimise(
             found = squares(start)
         except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
             found = squares(0.999 * start + 0.0005 * (low + high))
-    return found.x, float(found.cost)
+    g = problem.geometry(found.x[None])
+    violation, outside = np.abs(problem.equations(request, g)).max(), problem.outside(g).max(initial=-np.inf)
+    facing = np.abs(g.facing).min()
+    return Solution(found.x, float(violation), float(outside), float(found.cost), float(facing))
 
 
 def pinch_hint(problem: PinchProblem) -> str:
@@ -185,7 +163,7 @@ def pinch_hint(problem: PinchProblem) -> str:
 
 
 def _blame(problem: PinchProblem, request: PinchRequest) -> str:
-    """Whether geometry or torque is to blame, with figures."""
+    """Geometry or torque, with figures."""
     reach = solve(BorneProblem(problem), request)
     if not reach.holds:
         return blame_geometry(problem, problem.geometry(reach.x[None]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +13,7 @@ from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics
 from ...kinematics.equilibrium import FreeHand
-from ...kinematics.se3 import exp
+from ...kinematics.se3 import cross, exp
 from ...kinematics.tensors import null_space
 from ...typing import Array
 from ..mechanism.assembly import chain
@@ -133,7 +132,10 @@ class PinchProblem:
         """Of the object, as columns: long axis, grasp axis, their product."""
         self.preferred = self._half_bent()
         """Half-bent fingers: most at the last joint, which the pinch force bends anyway."""
-        self.towards = self._direction_of_grasp()
+        tips = self.tips(self.preferred)
+        across = tips[1:].mean(axis=0) - tips[0]
+        across -= self.along * (self.along @ across)
+        self.towards: Array = across / np.linalg.norm(across)
         self._third = np.cross(self.along, self.towards)
         # long axis along the hand's wanted direction, grasp axis from the thumb to the fingers
         self._nominal = np.column_stack([self.along, self.towards, self._third]) @ self.axes.T
@@ -159,17 +161,6 @@ class PinchProblem:
         self._pulling = tendon & J_a[:, self.moving].any(axis=1)
         self._rest()
 
-    def changed(
-        self, hand: HandDescription, obj: ObjectDescription, transmission: Transmission
-    ) -> PinchProblem:
-        """The same pinch with other figures: links, pads and what moves are the same."""
-        new = copy.copy(self)
-        new.hand, new.obj, new.transmission = hand, obj, transmission
-        new.joint_range = (hand.joint_lower[self.moving], hand.joint_upper[self.moving])
-        new._prepare_mechanism()
-        new.preferred = new._half_bent()
-        return new
-
     def _with_loops(self, moving: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """These joints, and those that move with them through loops."""
         if (loops := self.hand.loops) is not None:
@@ -193,29 +184,16 @@ class PinchProblem:
         """The nearest positions in the motors' ranges."""
         return np.clip(motor, self.hand.actuator_lower, self.hand.actuator_upper)
 
-    def _unpack(self, x: Array) -> tuple[Array, Array, Array]:
-        n = len(self.moving)
-        rotation = exp(torch.from_numpy(x[:, n + 3 : n + 6])).numpy() @ self._nominal
-        return self.posture(x[:, :n]), x[:, n : n + 3], rotation
-
-    def _direction_of_grasp(self) -> Array:
-        tips = self.tips(self.preferred)
-        across = tips[1:].mean(axis=0) - tips[0]
-        across -= self.along * (self.along @ across)
-        return across / np.linalg.norm(across)
-
     def tips(self, moving: Array) -> Array:
         """Centres of the pads' rounded ends ``(*batch, c, 3)`` [m]."""
         poses = self._pad_poses(moving)
         return np.einsum("...cij,cj->...ci", poses[..., :3, :3], self._tip) + poses[..., :3, 3]
 
-    def directions(self, moving: Array) -> Array:
-        """Outward directions of the pads' middles, hand frame ``(*batch, c, 3)``."""
-        return np.einsum("...cij,cj->...ci", self._pad_poses(moving)[..., :3, :3], self._palmar)
-
     def opposition(self, moving: Array) -> tuple[Array, Array]:
         """How well the pads face each other, cosines ``(b, c)``, and their distance ``(b,)`` [m]."""
-        facing, distance = opposition(self.tips(moving), self.directions(moving))
+        turns = self._pad_poses(moving)[..., :3, :3]
+        directions = np.einsum("...cij,cj->...ci", turns, self._palmar)
+        facing, distance = opposition(self.tips(moving), directions)
         return facing, distance - self._radius[0] - self._radius[1:].mean()
 
     def _pad_poses(self, moving: Array) -> Array:
@@ -254,7 +232,9 @@ class PinchProblem:
         own = np.append((x[:-1, :placed] != x[-1, :placed]).any(axis=1), True)
         rows = np.flatnonzero(own)
         place = np.where(own, np.cumsum(own) - 1, len(rows) - 1)
-        q, o, R = self._unpack(x[rows])
+        n = len(self.moving)
+        q, o = self.posture(x[rows, :n]), x[rows, n : n + 3]
+        R = exp(torch.from_numpy(x[rows, n + 3 : placed])).numpy() @ self._nominal
         poses = self.kinematics(torch.from_numpy(q))
         transforms = poses.transforms.numpy()
         links = transforms[:, self._links]
@@ -271,7 +251,7 @@ class PinchProblem:
         point = centre - self._radius[:, None] * n
         f = x[:, placed:].reshape(len(x), -1, 3)
         axes, origins = (part.numpy() for part in self.kinematics.joint_axes(poses))
-        lever = _cross(axes[:, None], point[:, :, None] - origins[:, None])  # (b, n_c, n_q, 3)
+        lever = cross(axes[:, None], point[:, :, None] - origins[:, None])  # (b, n_c, n_q, 3)
         return PinchGeometry(
             q=q[place],
             position=o[place],
@@ -295,7 +275,7 @@ class PinchProblem:
         weight = self.obj.mass * np.array(self.hand.gravity)
         force = g.force.sum(axis=1) + weight
         centre = g.rotation @ self.obj.com
-        moment = _cross(g.point - g.position[:, None], g.force).sum(axis=1) + _cross(centre, weight)
+        moment = cross(g.point - g.position[:, None], g.force).sum(axis=1) + cross(centre, weight)
         passive = self._unheld(g)[:, self.moving] @ self._passive
         press = -np.einsum("bi,bi->b", g.force[:, 0], g.normal[:, 0]) - request.force
         parts = [g.gap / 1e-4, force / 0.01, moment / 2e-4, passive / 1e-3, press[:, None] / 0.1]
@@ -327,8 +307,8 @@ class PinchProblem:
             for part in (at[:, 0], at[:, 1:].mean(axis=1))
         ]
         long_axis = g.rotation @ self.axes[:, 0]
-        wish = self._tilted(request)
-        tilt = (long_axis - wish) / 0.1
+        wish = self.along + request.tilt[0] * self._third + request.tilt[1] * self.towards
+        tilt = (long_axis - wish / np.linalg.norm(wish)) / 0.1
         facing = np.concatenate([-g.facing[:, :1], g.facing[:, 1:]], axis=1)
         opposed = np.maximum(0.0, 0.98 - facing) / 0.05
         clear = np.maximum(0.0, _CLEAR - g.clearance) / 1e-3
@@ -362,14 +342,14 @@ class PinchProblem:
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
-        load = self.joint_load(g)
+        load = self._joint_load(g)
         if self._constant:
             return load @ self._to_tension.T
         return self._reactions(g, load)[0][:, : self.hand.n_a]
 
     def _unheld(self, g: PinchGeometry) -> Array:
         """What of the joint load neither actuators nor loops nor couplings bear ``(batch, n_q)`` [N m]."""
-        load = self.joint_load(g)
+        load = self._joint_load(g)
         if self._constant:
             return load  # the passive motions are at right angles to all that is borne
         found, rows = self._reactions(g, load)
@@ -380,10 +360,6 @@ class PinchProblem:
         off = np.zeros_like(g.torque)
         off[:, self.moving] = self._unheld(g)[:, self.moving] @ self._passive @ self._passive.T
         return off
-
-    def passive_share(self, joint: int) -> float:
-        """How much of a torque at one joint nothing bears, 0 to 1."""
-        return float(np.square(self._passive[self.moving == joint]).sum())
 
     def slack(self, g: PinchGeometry) -> list[str]:
         """Tendons that would have to push, by name."""
@@ -400,15 +376,11 @@ class PinchProblem:
         found = np.linalg.pinv(rows.swapaxes(-1, -2), rcond=1e-9) @ (load @ self._free)[..., None]
         return found[..., 0], rows
 
-    def joint_load(self, g: PinchGeometry) -> Array:
+    def _joint_load(self, g: PinchGeometry) -> Array:
         """What springs and contacts ask of the tendons, for moment arms J_a, ``(batch, n_q)`` [N m]."""
         T = self.transmission
         inner = g.q + T.lean(g.torque)
         return (T.spring_torque(inner) + g.torque) / T.shape.arm(inner)
-
-    def _tilted(self, request: PinchRequest) -> Array:
-        wish = self.along + request.tilt[0] * self._third + request.tilt[1] * self.towards
-        return wish / np.linalg.norm(wish)
 
     def jacobian(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
         """Of :meth:`residuals`, central differences, all columns in one batch.
@@ -435,10 +407,3 @@ def opposition(tips: Array, directions: Array) -> tuple[Array, Array]:
     facing = np.einsum("bci,bi->bc", directions, across)
     facing[:, 1:] *= -1.0
     return facing, distance
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """As :func:`numpy.cross`, which takes twice as long for so few."""
-    a0, a1, a2 = a[..., 0], a[..., 1], a[..., 2]
-    b0, b1, b2 = b[..., 0], b[..., 1], b[..., 2]
-    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], axis=-1)

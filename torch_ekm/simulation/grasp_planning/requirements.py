@@ -89,11 +89,10 @@ def closes_pad(hand: HandDescription, pad: ContactPad) -> NDArray[np.bool_]:
 def _motions(hand: HandDescription, pad: ContactPad) -> tuple[Array, Array, Array]:
     """Pose of a pad's link at rest, velocity of the pad as each joint turns ``(n_q, 3)``, and the cosine
     between this and its direction ``(n_q,)``."""
-    kinematics = HandKinematics(hand)
-    poses = kinematics(torch.from_numpy(hand.spring_rest))
+    kinematics, rest = HandKinematics(hand), torch.from_numpy(hand.spring_rest)
+    poses = kinematics(rest)
     T = poses.of(pad.link).numpy()
-    axis, origin = (part.numpy() for part in kinematics.joint_axes(poses))
-    velocity = np.cross(axis, T[:3, :3] @ pad.end + T[:3, 3] - origin)
+    velocity = kinematics.jacobian(poses, pad.link, torch.tensor(pad.end, dtype=rest.dtype))[:3].mT.numpy()
     speed = np.linalg.norm(velocity, axis=1).clip(1e-9)
     return T, velocity, velocity @ (T[:3, :3] @ pad.direction) / speed
 
@@ -127,13 +126,9 @@ def unmet(problem: PinchProblem) -> list[Unmet]:
 
 def _closing(hand: HandDescription, joint: int) -> int:
     """Sign of the joint's motion when the hand closes; 0: not known."""
-    arms = [
-        arm
-        for actuator, arm in zip(hand.actuators, hand.actuation_jacobian[:, joint], strict=True)
-        if actuator.tendon and arm
-    ]
-    if arms:
-        return int(np.sign(sum(arms)))
+    arms = hand.actuation_jacobian[[actuator.tendon for actuator in hand.actuators], joint]
+    if arms.any():
+        return int(np.sign(arms.sum()))
     low, high = hand.joint_lower[joint], hand.joint_upper[joint]
     return int(np.sign(low + high)) if abs(low + high) > 0.2 * (high - low) else 0
 

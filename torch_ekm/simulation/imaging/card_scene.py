@@ -3,31 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..._extras import require
 from ...description import Shape
+from ...sensing.vision.board import MarkerBoard
 from ...sensing.vision.camera import PinholeCamera
 from ...typing import Array
 
 _SIDES = 32  # of the prism that stands for a cylinder
 _PER_BALL = 24  # points of the outline of a ball
-
-
-class Card(Protocol):
-    """Anything printed on a plane: a marker board, a calibration target."""
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Width and height of the printed card, rim included [m]."""
-        ...
-
-    def texture(self) -> NDArray[np.uint8]:
-        """Grey levels of the print, 0 black to 255 white, upper left first."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +26,6 @@ class ConvexBody:
     """``(n,)`` [m]"""
     shade: int = 90
     """Grey level, 0 black to 255 white."""
-
-    @classmethod
-    def capsule(cls, start: Array, end: Array, radius: float, shade: int = 90) -> ConvexBody:
-        return cls(np.stack([start, end]), np.full(2, radius), shade)
 
     @classmethod
     def of_shape(cls, shape: Shape, shade: int = 90) -> ConvexBody:
@@ -59,7 +41,7 @@ class ConvexBody:
             body = cls(np.concatenate(ends), np.zeros(2 * _SIDES), shade)
         else:
             end = np.array([0, 0, length / 2])
-            body = cls.capsule(-end, end, radius, shade)
+            body = cls(np.stack([-end, end]), np.full(2, radius), shade)
         return body.moved(shape.transform)
 
     def moved(self, transform: Array) -> ConvexBody:
@@ -99,7 +81,7 @@ class ConvexBody:
 class PlacedCard:
     """A card and its pose in the camera frame, ``(4, 4)``."""
 
-    card: Card
+    card: MarkerBoard
     pose: Array
 
     @property

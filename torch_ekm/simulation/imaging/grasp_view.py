@@ -12,6 +12,8 @@ from ...sensing.vision.board import MarkerBoard
 from ...typing import Array, Float, Tensor
 from .card_scene import CardScene, ConvexBody, PlacedCard
 
+_DISTANCE = 0.40  # [m] of the camera from the middle between the boards
+
 
 class GraspView:
     """``T_camera,card = T_hand,camera^-1 T_hand,body T_body,card``, and the same for every shape.
@@ -63,7 +65,7 @@ class GraspView:
         return CardScene(cards, tuple(bodies))
 
     @staticmethod
-    def facing(palm: Array, obj: Array, distance: float = 0.40) -> Array:
+    def facing(palm: Array, obj: Array) -> Array:
         """A camera pose from which two cards are seen equally askew.
 
         The camera looks at the point between the cards, from the direction half way between their
@@ -71,7 +73,6 @@ class GraspView:
 
         Args:
             palm, obj: poses of the cards in the hand frame, ``(4, 4)``.
-            distance: from the point between them [m].
 
         Raises:
             ParameterError: the cards face away from each other, or one hides in line with the other.
@@ -89,5 +90,5 @@ class GraspView:
         right /= np.linalg.norm(right)
         pose = np.eye(4)
         pose[:3, 0], pose[:3, 1], pose[:3, 2] = right, np.cross(forward, right), forward
-        pose[:3, 3] = (palm[:3, 3] + obj[:3, 3]) / 2 - distance * forward
+        pose[:3, 3] = (palm[:3, 3] + obj[:3, 3]) / 2 - _DISTANCE * forward
         return pose

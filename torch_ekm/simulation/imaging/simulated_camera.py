@@ -2,56 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ParameterError
 from ...sensing.vision.camera import PinholeCamera
-from .card_scene import Card, CardScene, ConvexBody, PlacedCard
+from .card_scene import CardScene, ConvexBody, PlacedCard
 
 _SAMPLES = 4  # of a card, per pixel and direction
 _SHIFT = 4  # fractional bits of OpenCV's polygon coordinates
 _EDGE_ON = 1e-6  # cosine below which a card shows nothing of its face
-
-
-@dataclass(frozen=True)
-class ImageQuality:
-    """What spoils a picture; the defaults are the nominal ones.
-
-    Raises:
-        ParameterError: a value is out of range.
-    """
-
-    blur: float = 0.7
-    """Standard deviation of lens and focus blur [px]."""
-    noise: float = 3.0
-    """Standard deviation of the noise of each pixel [grey levels of 255]."""
-    black: float = 30.0
-    """Grey level of black print in full light."""
-    white: float = 220.0
-    """Grey level of white paper in full light."""
-    background: float = 110.0
-    vignette: float = 0.15
-    """Loss of light at the corners of the image, as a fraction."""
-
-    def __post_init__(self) -> None:
-        for name in ("blur", "noise"):
-            if not getattr(self, name) >= 0:
-                raise ParameterError(f"ImageQuality.{name}", getattr(self, name), "zero or positive")
-        if not 0 <= self.black < self.white <= 255:
-            raise ParameterError("ImageQuality.black", self.black, "below white, both within 0..255")
-
-    def spoil(self, image: NDArray[Any], generator: np.random.Generator) -> NDArray[np.uint8]:
-        """The picture with blur and noise, in whole grey levels."""
-        if self.blur > 0:
-            image = require("cv2").GaussianBlur(image, (0, 0), self.blur)
-        if self.noise > 0:
-            image = image + self.noise * generator.standard_normal(image.shape, dtype=np.float32)
-        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+_BLUR = 0.7  # [px] standard deviation of lens and focus blur
+_NOISE = 3.0  # [grey levels of 255] standard deviation of each pixel
+_BLACK, _WHITE, _BACKGROUND = 30.0, 220.0, 110.0  # grey levels of print and paper in full light, and around
+_VIGNETTE = 0.15  # share of the light that the corners of the image lose
 
 
 class SimulatedCamera:
@@ -62,29 +27,25 @@ class SimulatedCamera:
 
     Args:
         camera: the lens, without distortion.
-        quality: blur, noise, light.
 
     Raises:
         ParameterError: a lens that distorts.
     """
 
-    def __init__(self, camera: PinholeCamera | None = None, quality: ImageQuality | None = None) -> None:
+    def __init__(self, camera: PinholeCamera | None = None) -> None:
         self.camera = camera or PinholeCamera()
         if any(self.camera.distortion):
             raise ParameterError(
                 "camera.distortion", self.camera.distortion, "0: straight lines are drawn straight"
             )
-        self.quality = quality or ImageQuality()
-        self._textures: dict[Card, NDArray[np.uint8]] = {}
         v, u = np.mgrid[: self.camera.height, : self.camera.width].astype(np.float32)
         radius2 = (u - self.camera.cx) ** 2 + (v - self.camera.cy) ** 2
-        self._light = 1 - self.quality.vignette * radius2 / radius2.max()
+        self._light = 1 - _VIGNETTE * radius2 / radius2.max()
 
     def render(self, scene: CardScene, generator: np.random.Generator) -> NDArray[np.uint8]:
         """Picture ``(height, width)`` of the scene; the generator draws its noise."""
         cv2 = require("cv2")
-        quality, shape = self.quality, (self.camera.height, self.camera.width)
-        drawn = np.full(shape, quality.background, dtype=np.uint8)
+        drawn = np.full((self.camera.height, self.camera.width), _BACKGROUND, dtype=np.uint8)
         # an outline is needed up to three times: for its body, and for each card that it may hide
         bodies = [(body, body.outline(self.camera)) for body in scene.bodies]
         for body, outline in sorted(bodies, key=lambda item: -item[0].centres[:, 2].mean()):
@@ -95,7 +56,10 @@ class SimulatedCamera:
         for card in sorted(scene.cards, key=lambda c: -c.pose[2, 3]):
             self._draw_card(image, card, bodies)
         image *= self._light
-        return quality.spoil(image, generator)
+        if _BLUR > 0:
+            image = cv2.GaussianBlur(image, (0, 0), _BLUR)
+        image = image + _NOISE * generator.standard_normal(image.shape, dtype=np.float32)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
     def _draw_card(
         self, image: NDArray, placed: PlacedCard, bodies: list[tuple[ConvexBody, NDArray | None]]
@@ -131,19 +95,16 @@ class SimulatedCamera:
                 cv2.fillConvexPoly(
                     visible, np.rint(fine * 2**_SHIFT).astype(np.int32), 0.0, cv2.LINE_8, _SHIFT
                 )
-        quality = self.quality
         light = 0.7 + 0.3 * cosine
         if away < 0:
-            if placed.card not in self._textures:
-                self._textures[placed.card] = placed.card.texture()
-            texture = self._textures[placed.card]
+            texture = placed.card.texture
             n_y, n_x = texture.shape
             tx = (X / width + 0.5) * n_x - 0.5
             ty = (0.5 - Y / height) * n_y - 0.5
             print_ = cv2.remap(texture, tx, ty, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            value = quality.black + (quality.white - quality.black) / 255 * print_
+            value = _BLACK + (_WHITE - _BLACK) / 255 * print_
         else:
-            value = np.full_like(visible, 0.6 * quality.white)  # the bare back
+            value = np.full_like(visible, 0.6 * _WHITE)  # the bare back
         size = (u1 - u0, v1 - v0)
         alpha = cv2.resize(visible, size, interpolation=cv2.INTER_AREA)
         colour = cv2.resize(value * (light * visible), size, interpolation=cv2.INTER_AREA)

@@ -24,13 +24,8 @@ class MujocoScene:
     """A :class:`Scene` in MuJoCo: elliptic friction cones, Newton's solver, the same bodies as in SAPIEN.
 
     Only the object and links collide. A drive ``k (target - q - dt v)`` is the force ``k (target - q)`` with
-    the damping ``dt k``, which MuJoCo integrates implicitly.
-
-    Args:
-        hand: the hand; its URDF gives links, inertias and shapes. Hand frame = world frame.
-        obj: the object, as it really is.
-        time_step: [s].
-        contact_stiffness: of each contact [N/m]; 0: as stiff as the time step allows.
+    the damping ``dt k``, which MuJoCo integrates implicitly. A rigid contact is as stiff as the time step
+    allows.
     """
 
     def __init__(

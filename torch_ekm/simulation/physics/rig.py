@@ -94,7 +94,12 @@ class Rig:
         self.time = 0.0
         self.run(round(_HOLDING / step), lambda part: plan.motor)
         scene.hold_object(False)
-        self.settle(_SETTLING)
+        self.wait(_SETTLING)
+        for _ in range(round(_FURTHER / 0.05)):
+            linear, angular = self.scene.object_speed
+            if max(10 * linear, angular) < _STILL:
+                break
+            self.wait(0.05)
 
     def follow(self, goals: Array, times: Array, frame: Callable[[], bool] | None = None) -> None:
         """Motors straight from goal to goal ``(n, n_a)`` [rad], at ``times (n,)`` [s] from now, or as fast as
@@ -127,15 +132,6 @@ class Rig:
     def state(self) -> TimedState:
         """As it truly is now."""
         return TimedState(self.time, self.scene.q, *self.scene.object_pose)
-
-    def settle(self, least: float) -> None:
-        """Wait that long [s] after a grasp, then until the object is still, 0.5 s more at most."""
-        self.wait(least)
-        for _ in range(round(_FURTHER / 0.05)):
-            linear, angular = self.scene.object_speed
-            if max(10 * linear, angular) < _STILL:
-                break
-            self.wait(0.05)
 
     def wait(self, duration: float, push: tuple[Array, Array] | None = None) -> None:
         """Let time pass [s] with the motors at rest, pushing the object by (force, torque) if asked."""

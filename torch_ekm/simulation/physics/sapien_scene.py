@@ -45,13 +45,7 @@ class SapienScene:
     """A :class:`Scene` in SAPIEN's PhysX, without a renderer.
 
     The solver is PGS: TGS applies gravity once per step but drives once per sub-iteration, which shifts
-    equilibria by about ``dt^2 k / I``.
-
-    Args:
-        hand: the hand; its URDF gives links, inertias and shapes. Hand frame = world frame.
-        obj: the object, as it really is.
-        time_step: [s].
-        contact_stiffness: of each contact [N/m]; 0: rigid. PhysX takes a negative restitution for it.
+    equilibria by about ``dt^2 k / I``. PhysX takes a negative restitution for the stiffness of a contact.
     """
 
     def __init__(

@@ -83,7 +83,14 @@ def make_scene(
     time_step: float,
     contact_stiffness: float,
 ) -> Scene:
-    """The scene of an engine, ``contact_stiffness`` [N/m] of each contact, 0: as rigid as the engine has it.
+    """The scene of an engine.
+
+    Args:
+        engine: one of :data:`ENGINES`.
+        hand: its URDF gives links, inertias and shapes.
+        obj: as it really is.
+        time_step: [s].
+        contact_stiffness: of each contact [N/m]; 0: as rigid as the engine has it.
 
     Raises:
         MissingExtraError: it is not installed.
