@@ -1,13 +1,19 @@
-"""The actuation map: virtual work, couplings, where a free hand rests."""
+"""The actuation map: virtual work, couplings, where a free hand rests, what linear constraints leave free.
+
+What the motors of iCub hands move: robotology/gazebo-yarp-plugins @f837061b, ControlBoardDriverCoupling.cpp.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from made_hands import write_hand
+from mk3 import distal_angle
 
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import ShapeError
@@ -79,3 +85,47 @@ def test_errors() -> None:
     assert "joints=4" in repr(actuation)
     single = ActuationMap(load_hand("planar_two_finger"), dtype=torch.float32)
     assert single.joints(torch.zeros(2)).dtype == torch.float32
+
+
+F64 = torch.float64
+
+
+@pytest.mark.parametrize(("m", "n", "repeated"), [(3, 7, 0), (3, 7, 2), (5, 5, 0), (0, 4, 0), (4, 0, 0)])
+def test_it_is_orthonormal_and_complete(m, n, repeated):
+    rows = torch.randn(m, n, dtype=F64, generator=torch.Generator().manual_seed(m))
+    N = null_space(torch.cat([rows, rows[:repeated] + rows[1 : repeated + 1]]))
+    assert N.shape == (n, max(n - m, 0))
+    assert torch.allclose(N.mT @ N, torch.eye(N.shape[1], dtype=F64))
+    assert (rows @ N).abs().amax() < 1e-14 if rows.numel() and N.numel() else True
+
+
+def test_a_row_of_rounding_errors_takes_nothing():
+    assert null_space(torch.full((1, 3), 1e-17, dtype=F64)).shape == (3, 3)
+
+
+def test_the_hand_has_the_public_coupling() -> None:
+    """Where the public coupling puts the joints for positions ``a``, the motors are at ``a``."""
+    hand = load_hand("icub_right")
+    for a in np.random.default_rng(0).uniform(10.0, 50.0, (10, 9)):
+        spread = 20 - a[0] / 3
+        q = [a[1], a[2], a[3] / 2, a[3] / 2, spread, a[4], a[5] / 2, a[5] / 2]
+        q += [0.0, a[6], a[7] / 2, a[7] / 2, *[spread, *[a[8] / 3] * 3] * 2]
+        posture = torch.from_numpy(np.radians(q))
+        assert np.degrees(ActuationMap(hand).actuators(posture).numpy()) == pytest.approx(a, abs=1e-9)
+        np.testing.assert_allclose(hand.coupling @ (posture.numpy() - hand.spring_rest), 0, atol=1e-12)
+
+
+def test_the_third_generation_closes_as_its_rods_say(tmp_path: Path) -> None:
+    """Closed, both joints of a finger are at the limits of the public URDF."""
+    hand = load_hand(write_hand("mk3", tmp_path))
+    assert (hand.n_q, hand.n_a) == (11, 7)
+    actuation, upper = ActuationMap(hand), torch.from_numpy(hand.actuator_upper)
+    closed = dict(zip(hand.joint_names, np.degrees(actuation.joints(upper).numpy()), strict=True))
+    middle = dict(zip(hand.joint_names, np.degrees(actuation.joints(upper / 2).numpy()), strict=True))
+    for finger, sums in (("thumb", (85, 55)), ("index", (95, 105.3)), ("medium", (95, 105.3))):
+        near, far = (closed[f"{finger}_{which}"] for which in ("proximal", "distal"))
+        assert (near, far) == pytest.approx(sums, abs=0.1)
+        near, far = (middle[f"{finger}_{which}"] for which in ("proximal", "distal"))
+        assert near + far == pytest.approx(sum(sums) / 2, abs=0.01)
+        rod = "thumb" if finger == "thumb" else "index"
+        assert far == pytest.approx(np.degrees(distal_angle(rod, np.radians(near))), abs=0.02)

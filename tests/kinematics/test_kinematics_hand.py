@@ -101,19 +101,6 @@ def test_batch_shapes(shape: tuple[int, ...]) -> None:
         torch.testing.assert_close(J[k], one, atol=1e-14, rtol=0)
 
 
-def test_axes_and_upstream_make_the_jacobian() -> None:
-    """``J_v = z x (x - o)`` for upstream joints: what a contact model builds for many points at once."""
-    kinematics, q = HandKinematics(load_hand("icub_left")), postures("icub_left")
-    axis, origin = kinematics.joint_axes(q)
-    x = kinematics(q).of("ring_tip")[:3, 3]
-    moves = kinematics.upstream[kinematics.link_index("ring_tip")]
-    expected = (torch.linalg.cross(axis, x - origin) * moves[:, None]).mT
-    torch.testing.assert_close(kinematics.jacobian(q, "ring_tip")[:3], expected)
-    names = [joint for joint, up in zip(kinematics.joint_names, moves, strict=True) if up]
-    assert names == ["ring_0", "ring_1", "ring_2", "ring_3"]
-    assert not kinematics.upstream[kinematics.link_index("hand")].any()
-
-
 def test_float32_and_to() -> None:
     hand, q = load_hand("icub_right"), postures("icub_right", 4)
     double = HandKinematics(hand)
