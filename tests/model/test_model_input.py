@@ -13,7 +13,14 @@ from model_toys import F64, batch_of, changed, planar_two_finger, relative_error
 
 from torch_ekm.contact import ContactSet
 from torch_ekm.description import load_hand, load_object
-from torch_ekm.exceptions import DescriptionError, EKMError, NonFiniteError, ParameterError, ShapeError
+from torch_ekm.exceptions import (
+    DescriptionError,
+    EKMError,
+    NonFiniteError,
+    ParameterError,
+    ShapeError,
+    UnknownNameError,
+)
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, ModelOptions
 
@@ -29,6 +36,10 @@ def state(rotation):
     return GraspState(STATE.q, STATE.position, rotation)
 
 
+def posture(q):
+    return GraspState(q, STATE.position, EYE)
+
+
 def with_contacts(**changes):
     return MODEL.linearize(STATE, CONTACTS.replace(**changes))
 
@@ -37,6 +48,15 @@ def at(field, value, where=1):
     tensor = getattr(CONTACTS, field).clone()
     tensor[where] = value
     return {field: tensor}
+
+
+def for_two(**options):
+    return MODEL.linearize(batch_of(STATE, STATE), **options)
+
+
+def expecting(n):
+    """The forces after n increments."""
+    return MODEL.linearize(STATE, expected=MODEL.linearize(STATE).forces_after(torch.zeros(n, 3, dtype=F64)))
 
 
 def felt(force):
@@ -60,7 +80,14 @@ WRONG = {
     "words": (lambda: GraspState(["left"], STATE.position, EYE), ParameterError, "numbers"),
     "ragged list": (lambda: GraspState([[0.1], [0.1, 0.2]], STATE.position, EYE), ParameterError, "numbers"),
     "one angle": (lambda: GraspState(torch.tensor(0.3), [0, 0, 0], EYE), ShapeError, "q must"),
+    "joints of another hand": (lambda: MODEL.linearize(posture(STATE.q[:5])), ShapeError, "j8"),
+    "motors of another hand": (lambda: MODEL(STATE, torch.zeros(4, dtype=F64)), ShapeError, "delta_a"),
     "float32 state": (lambda: MODEL.linearize(_single(STATE)), ParameterError, "float64"),
+    "NaN in points": (lambda: with_contacts(**at("point", NAN)), NonFiniteError, r"contacts\.point"),
+    "link of another hand": (lambda: with_contacts(link=("f9",) * 3), UnknownNameError, "f9"),
+    "contacts of one state": (lambda: for_two(contacts=CONTACTS), ShapeError, "gap"),
+    "no contacts of two states": (for_two, ShapeError, "contacts"),
+    "forces of two states": (lambda: expecting(2), ShapeError, r"expected\.force"),
     "NaN in curvature": (
         lambda: with_contacts(**at("finger_curvature", NAN)),
         NonFiniteError,
@@ -89,6 +116,7 @@ WRONG = {
         "sum of the others",
     ),
     "NaN step": (lambda: MODEL.linearize(STATE).step([0.1, NAN, 0.0]), NonFiniteError, "delta_a"),
+    "fingertips of another hand": (lambda: felt([1.0, 2.0]), ShapeError, "fingertip_force"),
     "negative fingertip force": (lambda: felt([1.0, -2.0, 1.0]), ParameterError, "fingertip_force"),
     "infinite fingertip force": (lambda: felt([1.0, math.inf, 1.0]), ParameterError, "fingertip_force"),
     "zero planar normal": (
