@@ -59,13 +59,6 @@ def test_positions_are_streamed_along_the_waypoints(driver) -> None:
     assert dates.min() >= driver.limits.period
 
 
-def test_a_servo_that_is_slower_than_the_path_takes_longer(tmp_path) -> None:
-    driver = FakeDriver(write(tmp_path, change="rate_deg = 200|rate_deg = 50"))
-    began = time.monotonic()
-    driver.follow(way((10, -10), speed=1000 * DEG), lambda seen: True)
-    assert time.monotonic() - began > 0.19
-
-
 def test_where_watch_answers_false_the_motors_hold_at_once(driver) -> None:
     asked = []
     start = driver.observe()
@@ -120,16 +113,6 @@ def test_motors_that_send_nothing_new_end_the_movement(driver) -> None:
 def test_each_piece_is_within_the_largest_increment(driver) -> None:
     with pytest.raises(CommandRefusedError, match=r"motor 'right': a command of -23 deg"):
         driver.follow(way((10, 11), (10, -12)), lambda seen: True)
-    assert not driver.written
-
-
-def test_a_dry_run_prints_the_waypoints(tmp_path) -> None:
-    said: list[str] = []
-    driver = FakeDriver(write(tmp_path), dry_run=True, say=said.append)
-    driver.follow(way((3, 0), (0, 0)), lambda seen: True)
-    assert [line.split(" (")[0] for line in said] == ["dry run: left"] * 2
-    assert "60.3 deg" in said[0]
-    assert "57.3 deg" in said[1]
     assert not driver.written
 
 
