@@ -59,6 +59,13 @@ def test_positions_are_streamed_along_the_waypoints(driver) -> None:
     assert dates.min() >= driver.limits.period
 
 
+def test_a_servo_that_is_slower_than_the_path_takes_longer(tmp_path) -> None:
+    driver = FakeDriver(write(tmp_path, change="rate_deg = 200|rate_deg = 50"))
+    began = time.monotonic()
+    driver.follow(way((10, -10), speed=1000 * DEG), lambda seen: True)
+    assert time.monotonic() - began > 0.19
+
+
 def test_where_watch_answers_false_the_motors_hold_at_once(driver) -> None:
     asked = []
     start = driver.observe()

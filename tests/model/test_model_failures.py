@@ -42,7 +42,7 @@ def test_no_contacts(toy):
 @pytest.mark.parametrize("on_unstable", ["raise", "flag"])
 def test_a_motion_that_nothing_resists_is_an_error_whatever_the_option_says(toy, on_unstable):
     one = changed(toy.model, contacts=select(toy.contacts, [0]), options={"on_unstable": on_unstable})
-    with pytest.raises(SingularGraspError, match="a motion of the object") as caught:
+    with pytest.raises(SingularGraspError, match=r"a motion of the object .* leave it free") as caught:
         one.linearize(toy.state)
     assert caught.value.direction[-3:].norm() > 0.1
     with pytest.raises(UnstableGraspError, match=r"^two hard fingers .* planar_normal, or torsional"):
@@ -133,9 +133,9 @@ def test_zero_springs_are_singular_unless_there_is_a_floor(toy):
     def linear(springs):
         return changed(model, spring_stiffness=springs).linearize(at.state, at.contacts, forces=forces)
 
-    with pytest.raises(SingularGraspError) as caught:
+    with pytest.raises(SingularGraspError, match="joints meets neither stiffness nor .* a spring") as caught:
         linear(stiffness)
-    assert caught.value.direction is not None  # of ring and little
+    assert float(caught.value.direction[free].norm()) == pytest.approx(1.0)  # of ring and little
     ours = [linear(stiffness + floor * (stiffness == 0)).object_jacobian for floor in (1e-4, 2e-4)]
     assert relative_error(ours[0], ours[1], 0) < 5e-3
 
@@ -214,15 +214,3 @@ def test_an_unstable_direction_is_reported():
     assert caught.value.stiffness == pytest.approx(-0.5)
     assert torch.allclose(caught.value.direction.abs(), torch.tensor([0.0, 1.0, 0.0], dtype=F64))
     assert float(two_stage(*driven, on_unstable="flag").stability) == pytest.approx(-0.5)
-
-
-@pytest.mark.parametrize(
-    ("free", "says"), [(1, "joints meets neither stiffness nor .* a spring"), (5, "object .* leave it free")]
-)
-def test_the_message_says_whose_motion_nothing_resists(free, says):
-    """Three joints, then the object's twist."""
-    stiffness = torch.ones(9, dtype=F64)
-    stiffness[free] = 0.0
-    with pytest.raises(SingularGraspError, match=says) as caught:
-        two_stage(torch.diag(stiffness), torch.eye(1, 9, dtype=F64), torch.eye(1, dtype=F64))
-    assert abs(float(caught.value.direction[free])) == pytest.approx(1.0)

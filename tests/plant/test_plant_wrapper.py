@@ -93,6 +93,27 @@ def test_an_array_where_a_tensor_is_expected_is_named() -> None:
     assert dataclasses.replace(seen, fingertip_force=None).fingertip_force is None
 
 
+def test_the_last_reading_before_a_command_is_the_one_that_counts() -> None:
+    """What a controller acted on; what had happened stays noted, and an earlier grasp is left out."""
+
+    class Eventful(Counter):
+        def command(self, delta_a: torch.Tensor) -> Observation:
+            return dataclasses.replace(super().command(delta_a), info={"events": ("a tug",)})
+
+    plant = RecordingPlant(Eventful())
+    plant.reset(1)
+    plant.command(torch.tensor(1))
+    plant.observe()  # belongs to an earlier grasp
+    plant.reset(6)
+    plant.command(torch.tensor(1))
+    plant.plant.count += 10  # another reading
+    seen = plant.observe()
+    kept = plant.trajectory.observations
+    assert [int(o.q[0]) for o in kept] == [6, 17]
+    assert len(plant.trajectory.commands) == 1
+    assert kept[-1].info["events"] == seen.info["events"] == ("a tug",)
+
+
 def test_what_is_recorded_in_mid_grasp_can_be_replayed() -> None:
     inner = Counter()
     inner.reset(3)
