@@ -90,14 +90,19 @@ from torch_ekm.exceptions import MissingExtraError
 
 for room in ("plant", "sensing", "simulation", "rendering", "interop"):
     importlib.import_module(f"torch_ekm.{room}")
-from torch_ekm.interop import RiverResidual
+from torch_ekm import interop
 
-try:
-    RiverResidual(3, 2)
-except MissingExtraError as error:
-    assert error.extra == "peers"
-else:
-    raise AssertionError
+for use, extra in (
+    (lambda: interop.RiverResidual(3, 2), "peers"),
+    (lambda: interop.as_river, "interop"),
+    (lambda: interop.to_casadi, "interop"),
+):
+    try:
+        use()
+    except MissingExtraError as error:
+        assert error.extra == extra
+    else:
+        raise AssertionError(extra)
 """
 
 

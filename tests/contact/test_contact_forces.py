@@ -1,4 +1,4 @@
-"""The force problem: exact where the answer is known, honest where there is none."""
+"""The force problem: exact where the answer is known, honest where there is none; its quadratic programs."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
-from contact_samples import F64, THREE, held
+import qpsolvers
+from contact_samples import THREE, held
 from force_oracles import cone_program, gaussian_posterior
 
 from torch_ekm.contact import (
@@ -19,6 +19,7 @@ from torch_ekm.contact import (
 )
 from torch_ekm.contact.forces import problem, solve
 from torch_ekm.contact.forces.problem import BalanceEquations, friction_cones, margins
+from torch_ekm.contact.forces.solve import EqualityProgram, solve_by_active_set
 from torch_ekm.exceptions import ParameterError
 
 WEIGHT = np.array([0.0, 0.0, -9.81 * 0.25, 0.0, 0.0, 0.0])
@@ -52,6 +53,23 @@ def equations(load=WEIGHT, *, gamma=0.0, friction=0.6, grip=3.0, seed=0, **chang
     eq = dataclasses.replace(eq, **changes)
     eq.__dict__["truth"] = (mu, lam)
     return eq
+
+
+def object_alone(directions, load, friction: float, gamma: float = 0.0) -> BalanceEquations:
+    """Nothing is asked of the joints."""
+    kin = held(directions, friction=friction, gamma=gamma)
+    G, n_c = grasp_matrix(kin).numpy(), len(directions)
+    return BalanceEquations(
+        object_matrix=G,
+        object_load=load,
+        hand_matrix=np.zeros((0, G.shape[1])),
+        actuator_matrix=np.zeros((0, 0)),
+        hand_load=np.zeros(0),
+        cones=friction_cones(kin.models, [friction] * n_c, [gamma] * n_c),
+        moment_rows=np.array([False] * 3 + [True] * 3),
+        tendon=np.zeros(0, bool),
+        spin_columns=(3, 7) if gamma else (),
+    )
 
 
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
@@ -100,23 +118,9 @@ def test_without_enough_friction_the_grasp_is_said_to_be_impossible():
     ],
 )
 def test_any_load_is_borne_where_there_is_force_closure_and_only_there(directions, friction, closure):
-    kin = held(directions, friction=friction)
-    G = grasp_matrix(kin).numpy()
-    cones = friction_cones(kin.models, [friction] * len(directions), [0.0] * len(directions))
-    borne = []
-    for load in np.random.default_rng(0).normal(size=(12, 6)) * [1, 1, 1, 0.03, 0.03, 0.03]:
-        eq = BalanceEquations(
-            object_matrix=G,
-            object_load=load,
-            hand_matrix=np.zeros((0, G.shape[1])),
-            actuator_matrix=np.zeros((0, 0)),
-            hand_load=np.zeros(0),
-            cones=cones,
-            moment_rows=np.array([False] * 3 + [True] * 3),
-            tendon=np.zeros(0, bool),
-        )
-        borne.append(contact_forces(eq).status is ForceStatus.SOLVED)
-    assert all(borne) is closure
+    loads = np.random.default_rng(0).normal(size=(12, 6)) * [1, 1, 1, 0.03, 0.03, 0.03]
+    found = [contact_forces(object_alone(directions, load, friction)).status for load in loads]
+    assert all(status is ForceStatus.SOLVED for status in found) is closure
 
 
 def test_measured_normal_forces_are_respected():
@@ -172,30 +176,14 @@ def bound_normals(monkeypatch, most):
 
 
 def test_soft_finger_bears_spin_up_to_its_coefficient(monkeypatch):
-    # a torque about the line between two opposite soft fingers, and a strong grip
-    kin = held([[1.0, 0, 0], [-1.0, 0, 0]], gamma=0.005, friction=0.5)
-    G = grasp_matrix(kin).numpy()
-    cones = friction_cones(kin.models, [0.5] * 2, [0.005] * 2)
-
-    def bearing(moment: float, f_max: float):
-        eq = BalanceEquations(
-            object_matrix=G,
-            object_load=np.array([0.0, 0, 0, moment, 0, 0]),
-            hand_matrix=hand_jacobian(kin).numpy().T,
-            actuator_matrix=np.zeros((6, 0)),
-            hand_load=np.zeros(6),
-            cones=cones,
-            moment_rows=np.array([False] * 3 + [True] * 3),
-            tendon=np.zeros(0, bool),
-            spin_columns=(3, 7),
-        )
-        bound_normals(monkeypatch, f_max)
-        return contact_forces(eq)
-
-    # two contacts of 4 N and 5 mm: at most 0.04 N m
-    assert bearing(0.039, 4.0).status is ForceStatus.SOLVED
-    assert bearing(0.041, 4.0).status is ForceStatus.NOT_GRASPABLE
-    assert torch.tensor(bearing(0.039, 4.0).mu, dtype=F64)[[0, 4]].max() <= 4.0 + 1e-9
+    """A torque about the line between two opposite contacts of 4 N and 5 mm: at most 0.04 N m."""
+    bound_normals(monkeypatch, 4.0)
+    loads = (np.array([0.0, 0, 0, moment, 0, 0]) for moment in (0.039, 0.041))
+    less, more = (
+        contact_forces(object_alone([[1.0, 0, 0], [-1.0, 0, 0]], load, 0.5, 0.005)) for load in loads
+    )
+    assert (less.status, more.status) == (ForceStatus.SOLVED, ForceStatus.NOT_GRASPABLE)
+    assert less.mu[[0, 4]].max() <= 4.0 + 1e-9
 
 
 def expecting(eq: BalanceEquations, seed=0, size=0.3) -> BalanceEquations:
@@ -244,3 +232,41 @@ def test_the_answer_without_inequalities_is_taken_only_where_it_keeps_them(monke
     bound_normals(monkeypatch, 2.5)
     low = contact_forces(free).mu[starts]
     assert low.max() < 2.5 + 1e-6
+
+
+def drawn(seed: int, n: int = 10):
+    draw = np.random.default_rng(seed)
+    m, k = 2, 12
+    root = draw.normal(size=(n, n))
+    A, G = draw.normal(size=(m, n)), draw.normal(size=(k, n))
+    x = draw.normal(size=n)  # keeps all rows: there is an optimum
+    return root @ root.T + 0.1 * np.eye(n), 5 * draw.normal(size=n), A, A @ x, G, G @ x + draw.uniform(size=k)
+
+
+def certify(P, q, A, b, G, h, found) -> None:
+    """Keeps the conditions of Karush, Kuhn and Tucker; PIQP agrees; its rows lead to it again."""
+    slope = P @ found.x + q + found.equality @ A + found.inequality @ G[found.active]
+    np.testing.assert_allclose(slope, 0, atol=1e-9)
+    np.testing.assert_allclose(A @ found.x, b, atol=1e-9)
+    assert (G @ found.x <= h + 1e-9).all()
+    assert (found.inequality >= 0).all()
+    problem = qpsolvers.Problem(P, q, G, h, A, b)
+    other = qpsolvers.solve_problem(problem, "piqp", eps_abs=1e-11, eps_rel=1e-11)
+    np.testing.assert_allclose(found.x, other.x, rtol=0, atol=1e-6)
+    again = solve_by_active_set(EqualityProgram(P, q, A, b), G, h, found.active)
+    assert again is not None
+    np.testing.assert_allclose(again.x, found.x, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_optimum_and_its_certificate(seed: int) -> None:
+    P, q, A, b, G, h = drawn(seed)
+    found = solve_by_active_set(EqualityProgram(P, q, A, b), G, h, [])
+    assert found is not None
+    certify(P, q, A, b, G, h, found)
+
+
+def test_rows_that_contradict_each_other_are_left_to_another_method() -> None:
+    P, q, A, b, _, _ = drawn(0)
+    G = np.stack([np.eye(10)[0], -np.eye(10)[0]])
+    assert solve_by_active_set(EqualityProgram(P, q, A, b), G, np.array([-1.0, -1.0]), []) is None

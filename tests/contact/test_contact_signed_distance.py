@@ -55,22 +55,6 @@ def test_one_point_and_many_give_the_same(kind):
     assert all(np.linalg.norm(n) == pytest.approx(1.0) for _, n in one)
 
 
-def test_a_union_is_as_near_as_its_nearest_part():
-    shapes = (placed("box", 3), placed("sphere", 4))
-    points = np.random.default_rng(5).uniform(-0.08, 0.08, (2, 50, 3))
-    both = signed_distance(shapes, points)[0]
-    assert both.shape == (2, 50)
-    single = [signed_distance((shape,), points)[0] for shape in shapes]
-    np.testing.assert_allclose(both, np.minimum(*single))
-
-
-def test_scaling_scales_the_distance():
-    shape, points = placed("capsule"), np.random.default_rng(6).uniform(-0.08, 0.08, (20, 3))
-    np.testing.assert_allclose(
-        signed_distance((shape.scaled(1.2),), 1.2 * points)[0], 1.2 * signed_distance((shape,), points)[0]
-    )
-
-
 def test_on_the_axis_of_a_cylinder_a_normal_is_given():
     long = Shape("cylinder", (0.02, 0.1), np.eye(4))
     distance, normal = signed_distance((long,), np.zeros((2, 3)))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from own_files import change, copied
 
-from torch_ekm.description import list_hands, load_hand, registry
+from torch_ekm.description import list_hands, load_hand, load_object, registry
 from torch_ekm.description.registry import urdf_folder
 from torch_ekm.exceptions import DescriptionError, EKMError, UnknownNameError
 
@@ -52,31 +52,26 @@ def test_icub_is_the_hand_of_the_paper(side: str) -> None:
 def test_icub_actuation_row_by_row() -> None:
     """da = J_a dq and C dq = 0, written out once more."""
     hand = load_hand("icub_right")
-    column = hand.joint_names.index
 
-    def row(**weights: float) -> np.ndarray:
-        out = np.zeros(20)
-        for joint, weight in weights.items():
-            out[column(joint)] = weight
-        return out
+    def arms(rows: np.ndarray) -> list[dict[str, float]]:
+        return [{hand.joint_names[k]: row[k] for k in np.flatnonzero(row)} for row in rows]
 
     halves = {f"{finger}_{k}": 0.5 for finger in ("ring", "little") for k in (1, 2, 3)}
     J_a = {
-        "hand_finger": row(index_0=-1, ring_0=-1, little_0=-1),
-        "thumb_oppose": row(thumb_0=1),
-        "thumb_proximal": row(thumb_1=1),
-        "thumb_distal": row(thumb_2=1, thumb_3=1),
-        "index_proximal": row(index_1=1),
-        "index_distal": row(index_2=1, index_3=1),
-        "middle_proximal": row(middle_1=1),
-        "middle_distal": row(middle_2=1, middle_3=1),
-        "pinky": row(**halves),
+        "hand_finger": {"index_0": -1, "ring_0": -1, "little_0": -1},
+        "thumb_oppose": {"thumb_0": 1},
+        "thumb_proximal": {"thumb_1": 1},
+        "thumb_distal": {"thumb_2": 1, "thumb_3": 1},
+        "index_proximal": {"index_1": 1},
+        "index_distal": {"index_2": 1, "index_3": 1},
+        "middle_proximal": {"middle_1": 1},
+        "middle_distal": {"middle_2": 1, "middle_3": 1},
+        "pinky": halves,
     }
-    assert hand.actuator_names == tuple(J_a)
-    np.testing.assert_array_equal(hand.actuation_jacobian, np.stack(list(J_a.values())))
-    signs = {joint: 1.0 if joint.startswith("ring") else -1.0 for joint in halves}
-    C = [row(middle_0=1), row(index_0=1, ring_0=-1), row(ring_0=1, little_0=-1), row(**signs)]
-    np.testing.assert_array_equal(hand.coupling, np.stack(C))
+    assert dict(zip(hand.actuator_names, arms(hand.actuation_jacobian), strict=True)) == J_a
+    signs = {joint: 1 if joint.startswith("ring") else -1 for joint in halves}
+    C = [{"middle_0": 1}, {"index_0": 1, "ring_0": -1}, {"ring_0": 1, "little_0": -1}, signs]
+    assert arms(hand.coupling) == C
     np.testing.assert_allclose(np.degrees(hand.actuator_upper), [60, 90, 90, 180, 90, 180, 90, 180, 270])
     np.testing.assert_allclose(np.degrees(hand.actuator_offset), [60, 0, 0, 0, 0, 0, 0, 0, 0])
     tendons = [actuator.name for actuator in hand.actuators if actuator.tendon]
@@ -131,12 +126,6 @@ def test_pads_lie_on_collision_shapes(name: str) -> None:
             np.testing.assert_allclose(ends[0], pad.start, atol=1e-9)
 
 
-def test_planar_hand_says_so() -> None:
-    hand = load_hand("planar_two_finger")
-    assert hand.planar_normal == (0.0, 0.0, 1.0)
-    np.testing.assert_array_equal(hand.actuation_jacobian, [[1, 0.8, 0, 0], [0, 0, 1, 0.8]])
-
-
 def test_gravity_is_the_files(tmp_path: Path) -> None:
     assert {load_hand(name).gravity for name in list_hands()} == {(0.0, 0.0, 9.81)}
     urdf, transmission = copied(tmp_path)
@@ -157,6 +146,10 @@ def test_unknown_names_list_the_right_ones() -> None:
     assert caught.value.name == "shadow"
     with pytest.raises(EKMError, match="no such URDF file"):
         load_hand("somewhere/else.urdf")
+    with pytest.raises(UnknownNameError, match=r"\.urdf or \.xml"):
+        load_hand("hand.json")
+    with pytest.raises(UnknownNameError, match="toothpaste, applier, box, weighted_box, bottle, can"):
+        load_object("banana")
 
 
 def test_files_are_what_the_generator_writes() -> None:

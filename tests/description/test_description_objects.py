@@ -10,14 +10,6 @@ from torch_ekm.description.registry import list_cylinders
 from torch_ekm.description.shape import merge_capsules
 
 
-def test_the_papers_six_and_six_more() -> None:
-    papers = {"toothpaste", "applier", "box", "weighted_box", "bottle", "can"}
-    more = set(list_objects()) - papers
-    assert set(list_objects()) > papers
-    widths, masses = zip(*((load_object(n).grasp_width, load_object(n).mass) for n in more), strict=True)
-    assert (min(widths), max(widths), min(masses), max(masses)) == pytest.approx((0.015, 0.066, 0.03, 0.3))
-
-
 @pytest.mark.parametrize("name", list_objects())
 def test_objects_are_physical(name: str) -> None:
     obj = load_object(name)

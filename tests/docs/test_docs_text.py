@@ -1,13 +1,15 @@
-"""What the pages' text must keep: the keys of the files that it describes, and tables that fit on a page."""
+"""What the pages' text must keep: what they name is there, what is there is named, tables fit on a page."""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from pathlib import Path
 
 import pytest
 
 from torch_ekm.description import transmission
+from torch_ekm.simulation import PRESETS, PlantParameters
 
 DOCS = Path(__file__).parents[2] / "docs"
 PACKAGE = DOCS.parent / "torch_ekm"
@@ -68,3 +70,9 @@ def test_the_glossary_is_short() -> None:
     terms = re.findall(r"^([^\s`#{][^\n]*)\n  \S", page, re.MULTILINE)
     assert 20 < len(terms) <= 60
     assert terms == sorted(terms, key=str.lower)
+
+
+def test_every_departure_and_preset_of_the_simulator_is_named() -> None:
+    text = (DOCS / "explanation" / "simulator.md").read_text(encoding="utf-8")
+    for name in (*(item.name for item in dataclasses.fields(PlantParameters)), *PRESETS):
+        assert f"`{name}`" in text, name

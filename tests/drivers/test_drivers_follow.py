@@ -123,16 +123,6 @@ def test_each_piece_is_within_the_largest_increment(driver) -> None:
     assert not driver.written
 
 
-def test_a_dry_run_prints_the_waypoints(tmp_path) -> None:
-    said: list[str] = []
-    driver = FakeDriver(write(tmp_path), dry_run=True, say=said.append)
-    driver.follow(way((3, 0), (0, 0)), lambda seen: True)
-    assert [line.split(" (")[0] for line in said] == ["dry run: left"] * 2
-    assert "60.3 deg" in said[0]
-    assert "57.3 deg" in said[1]
-    assert not driver.written
-
-
 def test_a_watchdog_that_runs_out_on_the_way_begins_with_the_piece_under_way(driver, monkeypatch) -> None:
     """The motors stop in the second piece: the first waypoint is not gone to again."""
     calls, send, noticed = [], driver.motors.send, []

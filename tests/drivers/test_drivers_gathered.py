@@ -76,7 +76,3 @@ def test_a_clock_that_runs_slow_is_followed() -> None:
     clock = SenderClock()
     ages = [100.0 * k - clock.taken(2.01 + 5e-5 * 100.0 * k, 100.0 * k) for k in range(36)]
     assert max(ages) < 0.01
-
-
-def test_a_message_without_a_stamp_counts_from_its_arrival() -> None:
-    assert SenderClock().taken(None, 10.0) == 10.0

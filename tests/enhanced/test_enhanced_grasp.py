@@ -1,8 +1,10 @@
-"""An E-KM of a grasped object."""
+"""An E-KM of a grasped object, and copies of it."""
 
 from __future__ import annotations
 
+import copy
 import math
+import pickle
 from types import SimpleNamespace
 
 import pytest
@@ -13,7 +15,9 @@ from torch_ekm.description import load_hand
 from torch_ekm.enhanced import EnhancedModel, GraspEncoding, grasp_learner
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics import GraspState, HandKinematics
+from torch_ekm.model import KinematicModel
 from torch_ekm.residual import SparseOnlineGP
+from torch_ekm.simulation import SimulatedHand
 
 DEG = math.pi / 180
 F64 = torch.float64
@@ -108,3 +112,23 @@ def test_learner_and_encoding_of_ones_own(model: Held, state: GraspState) -> Non
     assert ekm.encode is encode
     again = EnhancedModel.for_grasp(model, state, ekm.learner, encode)  # one that knows something already
     assert again.learner is ekm.learner
+
+
+@pytest.mark.parametrize(
+    "again", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))], ids=["copy", "pickle"]
+)
+def test_a_copy_predicts_the_same_and_learns_alone(again) -> None:
+    plant = SimulatedHand("icub_right", "box")
+    state = plant.reset(0).state
+    plant.close()
+    f = KinematicModel(plant.hand, plant.object)
+    model, da = EnhancedModel.for_grasp(f, state), torch.full((plant.hand.n_a,), 0.02, dtype=torch.float64)
+    model.update(state, da, 1.3 * f(state, da))
+    other = again(model)
+    before = model.predict(state, da)
+    assert torch.equal(other.predict(state, da).mean, before.mean)
+    assert torch.equal(again(f)(state, da), f(state, da))
+    for _ in range(3):
+        other.update(state, da, 0.5 * f(state, da))
+    assert torch.equal(model.predict(state, da).mean, before.mean)
+    assert not torch.equal(other.predict(state, da).mean, before.mean)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -131,39 +130,36 @@ def test_a_log_of_another_hand_is_refused() -> None:
         hand_health(load_hand("icub_right"), [(5, made.log)])
 
 
-def test_the_command_reads_logs(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_the_command_reads_logs(tmp_path: Path, monkeypatch) -> None:
     pytest.importorskip("h5py", reason="extra 'sim'")
-    pytest.importorskip("typer", reason="extra 'plots'")
-    from torch_ekm.cli import main
+    CliRunner = pytest.importorskip("typer.testing", reason="extra 'plots'").CliRunner
+    from torch_ekm.cli import app
 
-    def run(*arguments: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["torch-ekm", "health", *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        said = capsys.readouterr()
-        return end.value.code, (said.out + said.err).partition("Next:")[0]
+    def health(*names: str) -> tuple[int, str]:
+        done = CliRunner().invoke(app, ["health", *names])
+        return done.exit_code, done.output.partition("Next:")[0] or str(done.exception)
 
-    made, logs = Made(1), [str(tmp_path / "a"), str(tmp_path / "b")]
-    made.move(30)
-    with TrialLog(logs[0], {"hand": "yale_t42"}) as log:
-        log.write(0, made.log, {})
-        log.write(1, Trajectory(1), {})
-    assert run(logs[0]) == (0, "No actuator changed in 30 motions.\n")
-    early = Made(1)
+    def kept(name: str, made: Made, *more: Trajectory, hand: str = "yale_t42") -> None:
+        with TrialLog(name, {"hand": hand} if hand else {}) as log:
+            for trial, one in enumerate((made.log, *more)):
+                log.write(trial, one, {})
+
+    monkeypatch.chdir(tmp_path)
+    sound, early, later = Made(1), Made(1), Made(2)
+    sound.move(30)
     early.move(6)
-    with TrialLog(tmp_path / "early", {"hand": "yale_t42"}) as log:
-        log.write(0, early.log, {})
-    few = "No actuator changed in 6 motions. An actuator is judged after 12 motions.\n"
-    assert run(str(tmp_path / "early")) == (0, few)
-    later = Made(2)
     later.move(5)
     later.move(gave=(0.0, 25.0))
-    with TrialLog(logs[1], {}) as log:
-        log.write(6, later.log, {})
-    code, said = run(*logs)
+    kept("sound", sound, Trajectory(1))
+    kept("early", early)
+    kept("later", later, hand="")
+    assert health("sound") == (0, "No actuator changed in 30 motions.\n")
+    few = "No actuator changed in 6 motions. An actuator is judged after 12 motions.\n"
+    assert health("early") == (0, few)
+    code, said = health("sound", "later")
     assert code == 1
     assert "right" in said
     assert "tendon" in said
-    code, said = run(logs[1])
+    code, said = health("later")
     assert code == 1
     assert "--hand NAME" in said

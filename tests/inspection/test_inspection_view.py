@@ -22,7 +22,7 @@ from torch_ekm.exceptions import (
 )
 from torch_ekm.inspection.view import view, view_hand, view_log
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
-from torch_ekm.rendering import Captions, make_scene, save_animation
+from torch_ekm.rendering import Captions, save_animation
 from torch_ekm.simulation import SimulatedHand
 
 pytest.importorskip("sapien")
@@ -168,12 +168,6 @@ def test_what_cannot_be_shown_is_named(folder, tmp_path) -> None:
         ).save(tmp_path / "trial.h5")
         with pytest.raises(DescriptionError, match=match):
             view_log(path)
-
-
-def test_a_scene_without_an_object_is_the_hand_alone() -> None:
-    hand, q = load_hand("planar_two_finger"), np.zeros((2, 4))
-    scene = make_scene(hand, None, q, None, None, np.array([0, -9.81, 0]))
-    assert len(scene.shapes) == sum(len(link.collisions) for link in hand.urdf.links)
 
 
 def test_command_line(folder, tmp_path) -> None:

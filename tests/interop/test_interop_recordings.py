@@ -1,4 +1,4 @@
-"""Trials leave as MCAP; any recording is read without ROS."""
+"""Trials leave as MCAP, as .rrd and as a LeRobot dataset, and are read back; recordings without ROS."""
 
 from __future__ import annotations
 
@@ -8,41 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_up import trajectory
 
 from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
-from torch_ekm.interop import log_to_mcap, read_bag
+from torch_ekm.interop import log_to_lerobot, log_to_mcap, read_bag
 from torch_ekm.interop.bags import _numbers
-from torch_ekm.interop.mcap_log import _multi_array
 from torch_ekm.kinematics import se3
-from torch_ekm.plant import Observation, PlantStatus, Trajectory, TrialLog, Truth
+from torch_ekm.plant import Observation, Trajectory, TrialLog
 
 AnyReader = pytest.importorskip("rosbags.highlevel", reason="extra 'interop'").AnyReader
 pytest.importorskip("h5py", reason="extra 'sim'")
-
-
-def trajectory(seed: int, n: int = 3, forces: bool = True) -> Trajectory:
-    """Made up: what every sensor said, with raw counts, an image and events."""
-    random = torch.Generator().manual_seed(seed)
-
-    def some(*shape: int) -> torch.Tensor:
-        return torch.randn(*shape, generator=random, dtype=torch.float64)
-
-    seen = []
-    for k in range(n + 1):
-        rotation = se3.exp(some(3))
-        info = {
-            "raw": {"counts": torch.arange(4, dtype=torch.int32) + k, "image": torch.full((9, 9), k).byte()},
-            "estimate": {"covariance": some(2, 2).float()},
-        }
-        if k == 1:
-            info["events"] = ("a tendon slipped",)
-        q, a, position = some(4), some(2), some(3)
-        truth = Truth(q + 0.01, position, rotation)
-        status = PlantStatus.LOST if k == n else PlantStatus.HELD
-        force = some(2) if forces else None
-        seen.append(Observation(q, a, position, rotation, force, 0.1 * k + 0.3, status, info, truth))
-    return Trajectory(seed, [some(2) for _ in range(n)], seen, {"note": "made up"})
 
 
 def test_a_log_has_a_recording_for_each_trial(tmp_path: Path) -> None:
@@ -62,6 +38,7 @@ def test_a_log_has_a_recording_for_each_trial(tmp_path: Path) -> None:
     assert json.loads(said["/about"][0].data)["about"]["outcome"]["reason"] == "done"
     (image,) = (messages for topic, messages in said.items() if topic.endswith("/image"))
     assert [int(np.asarray(message.data).max()) for message in image] == [0, 1, 2, 3]
+    assert [(one.size, one.stride) for one in image[0].layout.dim] == [(9, 216), (8, 24), (3, 3)]
     assert [message.position.tolist() for message in said["/q"]] == [o.q.tolist() for o in one.observations]
     with pytest.raises(ParameterError, match="does not exist yet"):
         log_to_mcap(log, tmp_path / "bags")
@@ -74,7 +51,7 @@ def test_a_recording_is_a_table(tmp_path: Path) -> None:
     (bag,) = log_to_mcap(log, tmp_path / "bags")
     table = read_bag(bag, clock="/commands", topics=["/q", "/object_pose"])
     assert table.values.shape == (5, 2 + 4 + 7)
-    assert table.time == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert table.time == pytest.approx([0.0, 0.1, 0.4, 0.9, 1.6])
     columns = dict(zip(table.names, table.values.T, strict=True))
     assert columns["/q.position[1]"].tolist() == [float(o.q[1]) for o in one.observations[:5]]
     assert columns["/commands.position[0]"].tolist() == [float(c[0]) for c in one.commands]
@@ -90,7 +67,7 @@ def test_a_recording_is_a_table(tmp_path: Path) -> None:
     (file,) = bag.glob("*.mcap")
     assert np.array_equal(read_bag(file, "/commands", ["/q", "/object_pose"]).values, table.values)
     everything = read_bag(bag, clock="/q")
-    assert not any("image" in name for name in everything.names), "81 numbers are an image"
+    assert not any("image" in name for name in everything.names), "216 numbers are an image"
     with pytest.raises(UnknownNameError, match="/object_pose"):
         read_bag(bag, clock="/wrench")
 
@@ -108,38 +85,7 @@ def test_learners_are_compared_on_a_recording(tmp_path: Path) -> None:
         load_recording(file, **columns)
 
 
-@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
-def test_other_topics_stand_as_they_were_last_heard(kind: str, tmp_path: Path) -> None:
-    from rosbags import rosbag1, rosbag2
-    from rosbags.typesys import Stores, get_typestore
-
-    types = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
-    joints, number = types.types["sensor_msgs/msg/JointState"], types.types["std_msgs/msg/Float64"]
-    time = types.types["builtin_interfaces/msg/Time"](0, 0)
-    header = types.types["std_msgs/msg/Header"](*([0] if kind == "ros1" else []), time, "")
-    bag = tmp_path / ("own.bag" if kind == "ros1" else "own")
-    plugin = getattr(rosbag2.StoragePlugin, kind.upper(), None)
-    made = rosbag1.Writer(bag) if kind == "ros1" else rosbag2.Writer(bag, version=9, storage_plugin=plugin)
-    pack = types.serialize_ros1 if kind == "ros1" else types.serialize_cdr
-    with made as writer:
-        slow = writer.add_connection("/joints", "sensor_msgs/msg/JointState", typestore=types)
-        fast = writer.add_connection("/command", "std_msgs/msg/Float64", typestore=types)
-        for stamp in range(10):
-            if stamp % 4 == 2:
-                position = np.array([1.0, 2.0]) * stamp
-                message = joints(header, ["thumb", "index"], position, np.zeros(0), np.zeros(0))
-                writer.write(slow, 10**9 * stamp, pack(message, "sensor_msgs/msg/JointState"))
-            writer.write(fast, 10**9 * stamp + 1, pack(number(data=float(stamp)), "std_msgs/msg/Float64"))
-    table = read_bag(bag, clock="/command")
-    columns = dict(zip(table.names, table.values.T, strict=True))
-    assert columns["/command.data"].tolist() == [*range(10)]
-    index, thumb = columns["/joints.position.index"], columns["/joints.position.thumb"]
-    assert np.isnan(index[:2]).all()
-    assert index[2:].tolist() == [4, 4, 4, 4, 12, 12, 12, 12]
-    assert thumb[2:].tolist() == [2, 2, 2, 2, 6, 6, 6, 6]
-    assert table.age[:, table.names.index("/joints.position.thumb")][2:6] == pytest.approx(
-        [0, 1, 2, 3], abs=1e-8
-    )
+def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DescriptionError, match="no such recording"):
         read_bag(tmp_path / "nothing", clock="/command")
     (tmp_path / "broken.mcap").write_bytes(b"not a recording")
@@ -147,10 +93,74 @@ def test_other_topics_stand_as_they_were_last_heard(kind: str, tmp_path: Path) -
         read_bag(tmp_path / "broken.mcap", clock="/command")
 
 
-def test_strides_of_a_layout_count_all_later_sizes() -> None:
-    layout = _multi_array("std_msgs/msg/UInt8MultiArray", np.zeros((4, 5, 3), np.uint8)).layout
-    assert [(one.size, one.stride) for one in layout.dim] == [(4, 60), (5, 15), (3, 3)]
-
-
 def test_switches_of_a_message_are_numbers() -> None:
     assert dict(_numbers(np.array([True, False]), "on")) == {"on[0]": 1.0, "on[1]": 0.0}
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> TrialLog:
+    log = TrialLog(tmp_path / "log", {"hand": "made up"})
+    log.write(0, trajectory(0, 3), {"reason": "done"})
+    log.write(1, Trajectory(7), {"reason": "not grasped"})
+    log.write(4, trajectory(4, 5), {"reason": "done"})
+    return log
+
+
+def frames(log: TrialLog) -> list[tuple[Observation, torch.Tensor]]:
+    """Observations, and the command after each; zeros at the end."""
+    found = []
+    for trial in (0, 4):
+        read = log.read(trial)
+        found += zip(read.observations, [*read.commands, torch.zeros(2).double()], strict=True)
+    return found
+
+
+def same(row, seen: Observation, command: torch.Tensor) -> None:
+    pose = torch.cat([seen.position, se3.log(seen.rotation)])
+    for name, value in (
+        ("action", command),
+        ("observation.state", torch.cat([seen.q, seen.a])),
+        ("observation.environment_state", pose),
+        ("observation.fingertip_force", seen.fingertip_force),
+    ):
+        read = torch.as_tensor(row[name], dtype=torch.float64)
+        torch.testing.assert_close(read, value, rtol=1e-6, atol=1e-6)
+    assert float(np.squeeze(row["observation.time"])) == pytest.approx(seen.time, abs=1e-6)
+
+
+def test_a_dataset_has_a_frame_for_each_observation(log: TrialLog, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="extra 'interop'")
+    folder = log_to_lerobot(log, tmp_path / "dataset", "turn it")
+    rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet").to_pylist()
+    for row, (seen, command) in zip(rows, frames(log), strict=True):
+        same(row, seen, command)
+    assert [row["index"] for row in rows] == list(range(10))
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["total_episodes"], info["robot_type"]) == ("v3.0", 2, "made up")
+    stats = json.loads((folder / "meta/stats.json").read_text())["observation.time"]
+    times = [seen.time for seen, _ in frames(log)]
+    assert [stats["mean"][0], stats["max"][0]] == pytest.approx([np.mean(times), max(times)])
+    with pytest.raises(ParameterError, match="does not exist yet"):
+        log_to_lerobot(log, folder)
+
+
+def test_a_dataset_is_of_one_hand(log: TrialLog, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="extra 'interop'")
+    log.write(5, trajectory(5, 2, n_a=3), {})
+    with pytest.raises(ParameterError, match="all with the same joints"):
+        log_to_lerobot(log, tmp_path / "dataset")
+    assert not (tmp_path / "dataset").exists()
+
+
+def test_lerobot_reads_the_dataset(log: TrialLog, tmp_path: Path) -> None:
+    lerobot = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot, of the users' own")
+    folder = log_to_lerobot(log, tmp_path / "dataset", "turn it")
+    dataset = lerobot.LeRobotDataset("of/this", root=folder)
+    assert (len(dataset), dataset.num_episodes, dataset.fps) == (10, 2, 1)
+    for k, (seen, command) in enumerate(frames(log)):
+        same(dataset[k], seen, command)
+        assert dataset[k]["task"] == "turn it"
+        assert int(dataset[k]["episode_index"]) == int(k >= 4)
+    assert dataset.meta.episodes[1]["dataset_from_index"] == 4
+    windows = lerobot.LeRobotDataset("of/this", root=folder, delta_timestamps={"action": [0.0, 1.0]})
+    assert windows[3]["action_is_pad"].tolist() == [False, True], "an episode ends"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 _HEAD = '<mujoco model="{name}"><compiler angle="radian"/><option gravity="0 0 0"/>'
 _PALM = '<geom type="box" size=".02 .02 .01"/>'
 
@@ -21,8 +19,9 @@ def _finger(near: str = "", far: str = "", prefix: str = "", x: float = 0.0) -> 
     return _link(f"{prefix}near", 0.02, _link(f"{prefix}far", 0.04, joint=far), near, x)
 
 
-def _hand(name: str, bodies: str, rest: str) -> str:
+def _hand(name: str, bodies: str, tendons: str = "", actuators: str = "", equality: str = "") -> str:
     palm = f'<body name="palm">{_PALM}<site name="palm_site" pos=".01 0 .012"/>{bodies}</body>'
+    rest = f"<tendon>{tendons}</tendon><equality>{equality}</equality><actuator>{actuators}</actuator>"
     return f"{_HEAD.format(name=name)}<worldbody>{palm}</worldbody>{rest}</mujoco>"
 
 
@@ -35,104 +34,79 @@ def _routed(name: str, sites: tuple[str, ...], more: str = "") -> str:
     return f'<spatial name="{name}" {more}>' + "".join(f'<site site="{s}"/>' for s in sites) + "</spatial>"
 
 
-def _pull(tendon: str, kp: float, most: float, more: str = 'forcerange="0 1e6"') -> str:
-    limited = f'ctrlrange="0 {most}" {more}'
-    return f'<actuator><position name="motor" tendon="{tendon}" kp="{kp}" {limited}/></actuator>'
+def _pull(tendon: str, kp: float, span: str, more: str = 'forcerange="0 1e6"', name: str = "motor") -> str:
+    return f'<position name="{name}" tendon="{tendon}" kp="{kp}" ctrlrange="{span}" {more}/>'
+
+
+def _turn(joint: str, kp: float, most: float, name: str = "motor") -> str:
+    return f'<position name="{name}" joint="{joint}" kp="{kp}" ctrlrange="0 {most}"/>'
 
 
 _WAY = ("palm_site", "near_low", "near_high", "far_low", "far_high")
-_ARMS = {"near": 0.01, "far": 0.008}
+_ARMS, _RATIOS = {"near": 0.01, "far": 0.008}, {"near": 1.0, "far": 0.8}
+_FLEXOR, _BY_RATIOS = _fixed("flexor", _ARMS), _fixed("flexor", _RATIOS)
+_STIFF, _SHORTENS = _pull("flexor", 1e4, "0 0.025"), 'forcerange="-1e6 0"'
+_COUPLER = (
+    '<body name="coupler" pos="0 0 .04"><joint name="coupler" axis="0 1 0" range="-1.6 1.6"/>'
+    '<geom type="capsule" size=".004" fromto="0 0 .005 0 0 .025"/></body>'
+)
+_TWO_FINGERS = _finger('stiffness=".05"', 'stiffness=".04"') + _finger(
+    'stiffness=".03"', 'stiffness=".06"', "b_", 0.03
+)
 
+# bodies; tendons, actuators, equality
+_MADE: dict[str, tuple[str, ...]] = {
+    "tendon_spring": (
+        _finger('stiffness=".035"'),
+        _FLEXOR + _fixed("back", {"far": 0.01}, 'stiffness="350" springlength="0"'),
+        _STIFF,
+    ),
+    "slack_spring": (
+        _finger('stiffness=".02"', 'stiffness=".03"'),
+        _FLEXOR + _fixed("back", _ARMS, 'stiffness="900" springlength="0 .006"'),
+        _STIFF,
+    ),
+    "routed_flexor": (
+        _finger('stiffness=".04"', 'stiffness=".03"'),
+        _routed("flexor", _WAY),
+        _pull("flexor", 8000, ".05 .1", _SHORTENS),
+    ),
+    "routed_spring": (
+        _finger('stiffness=".05"', 'stiffness=".05"'),
+        _FLEXOR + _routed("back", _WAY, 'stiffness="300" springlength=".07"'),
+        _STIFF,
+    ),
+    "stops": (_finger('stiffness=".01"', 'stiffness=".05"'), _BY_RATIOS, _pull("flexor", 40, "0 2.6")),
+    "preloaded": (
+        _finger('stiffness=".1" springref="-1"', 'stiffness=".05"'),
+        _BY_RATIOS,
+        _pull("flexor", 40, "0 2.0"),
+    ),
+    "servos": (_finger(), "", _turn("near", 8, 1.5, "m_near") + _turn("far", 3, 1.5, "m_far")),
+    "coupled": (
+        _finger('stiffness=".1"', 'stiffness=".05" springref=".3"'), "", _turn("near", 5, 1.5),
+        '<joint joint1="far" joint2="near" polycoef="0 .7 0 0 0"/>',
+    ),
+    "curved": (
+        _finger('stiffness=".1"', 'stiffness=".05"'), "", _turn("near", 5, 1.5),
+        '<joint joint1="far" joint2="near" polycoef=".05 .6 .3 -.1 0"/>',
+    ),
+    "four_bar": (
+        _link("crank", 0.02, _COUPLER, x=0.03) + _link("rocker", 0.02, joint='stiffness=".05"', x=0.015),
+        "", _turn("crank", 4, 1), '<connect body1="coupler" body2="rocker" anchor="0 0 .03"/>',
+    ),
+    "tied_tendons": (
+        _TWO_FINGERS,
+        _fixed("one", _ARMS) + _fixed("other", {"b_near": 0.01, "b_far": 0.006}),
+        _pull("one", 6000, "0 0.02", ""),
+        '<tendon tendon1="one" tendon2="other" polycoef="0 1 0 0 0"/>',
+    ),
+    "two_motors": (
+        _finger('stiffness=".04"', 'stiffness=".02"'),
+        _FLEXOR + _routed("extensor", _WAY) + _fixed("stay", {"far": 0.01}, 'stiffness="200"'),
+        _pull("flexor", 9000, "0 .02", name="flex") + _pull("extensor", 4000, ".05 .1", _SHORTENS, "hold"),
+    ),
+}  # fmt: skip
 
-def _tendon_spring() -> str:
-    tendons = _fixed("flexor", _ARMS) + _fixed("back", {"far": 0.01}, 'stiffness="350" springlength="0"')
-    rest = f"<tendon>{tendons}</tendon>" + _pull("flexor", 1e4, 0.025)
-    return _hand("tendon_spring", _finger('stiffness=".035"'), rest)
-
-
-def _slack_spring() -> str:
-    tendons = _fixed("flexor", _ARMS) + _fixed("back", _ARMS, 'stiffness="900" springlength="0 .006"')
-    rest = f"<tendon>{tendons}</tendon>" + _pull("flexor", 1e4, 0.025)
-    return _hand("slack_spring", _finger('stiffness=".02"', 'stiffness=".03"'), rest)
-
-
-def _routed_flexor() -> str:
-    tendon = f"<tendon>{_routed('flexor', _WAY)}</tendon>"
-    motor = (
-        '<actuator><position name="motor" tendon="flexor" kp="8000" ctrlrange=".05 .1" forcerange="-1e6 0"/>'
-    )
-    return _hand("routed", _finger('stiffness=".04"', 'stiffness=".03"'), f"{tendon}{motor}</actuator>")
-
-
-def _routed_spring() -> str:
-    tendons = _fixed("flexor", _ARMS) + _routed("back", _WAY, 'stiffness="300" springlength=".07"')
-    rest = f"<tendon>{tendons}</tendon>" + _pull("flexor", 1e4, 0.025)
-    return _hand("routed_spring", _finger('stiffness=".05"', 'stiffness=".05"'), rest)
-
-
-def _stops() -> str:
-    rest = f"<tendon>{_fixed('flexor', {'near': 1.0, 'far': 0.8})}</tendon>" + _pull("flexor", 40, 2.6)
-    return _hand("stops", _finger('stiffness=".01"', 'stiffness=".05"'), rest)
-
-
-def _preloaded() -> str:
-    rest = f"<tendon>{_fixed('flexor', {'near': 1.0, 'far': 0.8})}</tendon>" + _pull("flexor", 40, 2.0)
-    bodies = _finger('stiffness=".1" springref="-1"', 'stiffness=".05"')
-    return _hand("preloaded", bodies, rest)
-
-
-def _servos() -> str:
-    motors = "".join(
-        f'<position name="m_{j}" joint="{j}" kp="{kp}" ctrlrange="0 1.5"/>'
-        for j, kp in (("near", 8), ("far", 3))
-    )
-    return _hand("servos", _finger(), f"<actuator>{motors}</actuator>")
-
-
-def _coupled() -> str:
-    rest = '<equality><joint joint1="far" joint2="near" polycoef="0 .7 0 0 0"/></equality>'
-    rest += '<actuator><position name="motor" joint="near" kp="5" ctrlrange="0 1.5"/></actuator>'
-    return _hand("coupled", _finger('stiffness=".1"', 'stiffness=".05" springref=".3"'), rest)
-
-
-def _curved() -> str:
-    rest = '<equality><joint joint1="far" joint2="near" polycoef=".05 .6 .3 -.1 0"/></equality>'
-    rest += '<actuator><position name="motor" joint="near" kp="5" ctrlrange="0 1.5"/></actuator>'
-    return _hand("curved", _finger('stiffness=".1"', 'stiffness=".05"'), rest)
-
-
-def _four_bar() -> str:
-    coupler = '<body name="coupler" pos="0 0 .04"><joint name="coupler" axis="0 1 0" range="-1.6 1.6"/>'
-    coupler += '<geom type="capsule" size=".004" fromto="0 0 .005 0 0 .025"/></body>'
-    bodies = _link("crank", 0.02, coupler, x=0.03) + _link("rocker", 0.02, joint='stiffness=".05"', x=0.015)
-    rest = '<equality><connect body1="coupler" body2="rocker" anchor="0 0 .03"/></equality>'
-    rest += '<actuator><position name="motor" joint="crank" kp="4" ctrlrange="0 1"/></actuator>'
-    return _hand("four_bar", bodies, rest)
-
-
-def _tied_tendons() -> str:
-    tendons = _fixed("one", _ARMS) + _fixed("other", {"b_near": 0.01, "b_far": 0.006})
-    rest = f"<tendon>{tendons}</tendon>"
-    rest += '<equality><tendon tendon1="one" tendon2="other" polycoef="0 1 0 0 0"/></equality>'
-    fingers = _finger('stiffness=".05"', 'stiffness=".04"')
-    fingers += _finger('stiffness=".03"', 'stiffness=".06"', "b_", 0.03)
-    return _hand("tied", fingers, rest + _pull("one", 6000, 0.02, ""))
-
-
-def _two_motors() -> str:
-    tendons = (
-        _fixed("flexor", _ARMS) + _routed("extensor", _WAY) + _fixed("stay", {"far": 0.01}, 'stiffness="200"')
-    )
-    motors = '<position name="flex" tendon="flexor" kp="9000" ctrlrange="0 .02" forcerange="0 1e6"/>'
-    motors += '<position name="hold" tendon="extensor" kp="4000" ctrlrange=".05 .1" forcerange="-1e6 0"/>'
-    rest = f"<tendon>{tendons}</tendon><actuator>{motors}</actuator>"
-    return _hand("two_motors", _finger('stiffness=".04"', 'stiffness=".02"'), rest)
-
-
-_MADE: tuple[Callable[[], str], ...] = (
-    _tendon_spring, _slack_spring, _routed_flexor, _routed_spring, _stops, _preloaded,
-    _servos, _coupled, _curved, _four_bar, _tied_tendons, _two_motors,
-)  # fmt: skip
-
-MECHANISMS = {make.__name__[1:]: make() for make in _MADE}
+MECHANISMS = {name: _hand(name, *parts) for name, parts in _MADE.items()}
 """Name -> MJCF, twelve of them."""

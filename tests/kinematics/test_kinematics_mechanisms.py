@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from made_hands import write_hand
+from mechanisms import MECHANISMS
+from scipy.interpolate import CubicSpline
+
+from torch_ekm.description import HandDescription, load_hand, write_transmission
+from torch_ekm.description.lengths import ArmFunction, Lengths
+from torch_ekm.kinematics import ActuationMap
 
 mujoco = pytest.importorskip("mujoco")
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
-from made_hands import write_hand  # noqa: E402
-from mechanisms import MECHANISMS  # noqa: E402
-from scipy.interpolate import CubicSpline  # noqa: E402
-
-from torch_ekm.description import HandDescription, load_hand, write_transmission  # noqa: E402
-from torch_ekm.description.lengths import ArmFunction, Lengths  # noqa: E402
-from torch_ekm.kinematics import ActuationMap  # noqa: E402
 
 SHARES = (0.15, 0.5, 0.85)  # of the motors' ranges
 

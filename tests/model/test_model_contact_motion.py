@@ -7,6 +7,7 @@ import dataclasses
 import pytest
 import torch
 from model_toys import F64, planar_two_finger, soft_two_finger
+from turning_step import turning_step
 
 from torch_ekm.estimation.hand_figures import HandFigures
 from torch_ekm.exceptions import GraspError
@@ -18,14 +19,7 @@ DEG = torch.pi / 180
 
 
 def turning(lin, axis, step):
-    """Least squares: turn about the axis, hardly about others, keep the normal forces, small effort."""
-    J = lin.object_jacobian[3:]
-    across = torch.eye(3, dtype=F64) - torch.outer(axis, axis)
-    eye = torch.eye(J.shape[1], dtype=F64)
-    rows = torch.cat([100 * (axis @ J)[None], 3 * across @ J, 0.3 * lin.normal_force_sensitivity, 0.3 * eye])
-    wish = torch.zeros(len(rows), dtype=F64)
-    wish[0] = 100 * step
-    return torch.linalg.lstsq(rows, wish).solution
+    return turning_step(lin, axis, step, lin.forces.normal, keep=0.3)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import torch
 from model_icub import gripped
 from model_toys import F64, select, soft_two_finger, three_finger
 
-from torch_ekm.exceptions import ShapeError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model.grasp_forces import friction_use, margin_std
 
@@ -118,10 +117,3 @@ def test_a_contact_that_was_not_expected_joins_in(toy):
     assert torch.allclose(
         again.force, toy.model.linearize(toy.state, expected=expected).forces.force, atol=1e-6
     )
-
-
-def test_expected_forces_of_another_batch_are_refused(toy):
-    lin = toy.model.linearize(toy.state)
-    many = lin.forces_after(torch.zeros(2, 3, dtype=F64))
-    with pytest.raises(ShapeError, match=r"expected\.force"):
-        toy.model.linearize(toy.state, expected=many)

@@ -1,19 +1,19 @@
-"""The iCub hand itself in a three-finger pinch of a box: noise, joints at their stops, batches."""
+"""The iCub hand itself in a three-finger pinch of a box: noise, joints at their stops; batches."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
 import torch
 from equilibrium import EquilibriumSolver
-from model_icub import DEG, gripped
+from model_icub import DEG, GRASPS, gripped
 from model_toys import F64, batch_of, changed, finite_difference_jacobian, relative_error, stacked
 
 from torch_ekm.contact import ForceOptions
 from torch_ekm.contact.contact_set import SHARED, VARYING
-from torch_ekm.exceptions import ShapeError
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel
 
@@ -36,21 +36,6 @@ def test_with_noise_forces_are_found_and_the_jacobian_stays_near():
         assert float(lin.forces.margin.min()) > -1e-6
         errors.append(relative_error(lin.manipulation_jacobian, exact, 20))
     assert np.median(errors) < 0.15
-
-
-def test_batch_equals_single_states():
-    model, solver, at = gripped("box")
-    states = list(noisy_states(at, 3, 1))
-    contacts = [solver.surfaces(s.q, s.position, s.rotation) for s in states]
-    batch = batch_of(*states), stacked(*contacts)
-    lin, da = model.linearize(*batch), torch.full((9,), 0.01, dtype=F64)
-    moved = model(batch[0], da.expand(3, 9), batch[1])
-    for i, (state, touching) in enumerate(zip(states, contacts, strict=True)):
-        single = model.linearize(state, touching)
-        for name in ("manipulation_jacobian", "contact_force_sensitivity", "margin_sensitivity", "stability"):
-            ours, theirs = getattr(lin, name)[i], getattr(single, name)
-            assert (ours - theirs).norm() <= 1e-9 * theirs.norm() + 1e-12, name
-        assert torch.allclose(moved[i], model(state, da, touching), atol=1e-12)
 
 
 def test_float32():
@@ -116,5 +101,42 @@ def test_how_much_a_stop_bears_is_told_by_the_fingertips():
     assert (lin.forces.mu - pressed.mu).norm() < 1e-2 * pressed.mu.norm()
     expected = finite_difference_jacobian(solver, pressed, 2e-4)
     assert relative_error(lin.manipulation_jacobian, expected, 20) < 1e-3
-    with pytest.raises(ShapeError, match="fingertip_force"):
-        model.linearize(at.state, at.contacts, fingertip_force=felt[:2])
+
+
+def assert_same(one, many, k):
+    """A state's answer is the k-th of a batch."""
+    for field in dataclasses.fields(one):
+        a, b = getattr(one, field.name), getattr(many, field.name)
+        if isinstance(a, torch.Tensor) and field.name != "described":
+            message = functools.partial("{}: {}".format, field.name)
+            torch.testing.assert_close(a, b[k], rtol=1e-9, atol=1e-9, msg=message)
+
+
+@pytest.mark.parametrize("name", GRASPS)
+def test_a_state_in_numpy_is_the_state_in_torch(name) -> None:
+    """Two states, which torch computes as a batch."""
+    model, state, contacts = GRASPS[name]()
+    n_a = model.hand.n_a
+    da = 0.01 * torch.arange(1, n_a + 1).to(F64)
+    states = state, state.plus(torch.full((state.n_s,), 2e-4, dtype=F64))
+    batch = batch_of(*states), stacked(contacts, contacts)
+    ones, many = [model.linearize(one, contacts) for one in states], model.linearize(*batch)
+    for _ in range(2):  # with nothing known of the forces, and with those that are expected
+        assert many.forces.status == sum((one.forces.status for one in ones), ())
+        assert {doubt.kind for doubt in many.doubts} == {doubt.kind for one in ones for doubt in one.doubts}
+        after, margins = many.forces_after(da.expand(2, -1)), many.margins_after(da.expand(2, -1))
+        for k, one in enumerate(ones):
+            assert_same(one.forces, many.forces, k)
+            assert_same(one, many, k)
+            assert_same(one.forces_after(da), after, k)
+            torch.testing.assert_close(one.margins_after(da), margins[k], rtol=0, atol=1e-9)
+        expected = [one.forces_after(0 * da) for one in ones]
+        every = many.forces_after(0 * da.expand(2, -1))
+        ones = [
+            model.linearize(state, contacts, expected=known, previous=one)
+            for state, known, one in zip(states, expected, ones, strict=True)
+        ]
+        many = model.linearize(*batch, expected=every, previous=many)
+    moved = model(batch[0], da.expand(2, -1), batch[1])
+    for k, state in enumerate(states):
+        torch.testing.assert_close(moved[k], model(state, da, contacts), rtol=0, atol=1e-9)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import copy
-import sys
-from pathlib import Path
+import dataclasses
 
 import pytest
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-
 from made_hands import write_hand
+from model_toys import batch_of, stacked
 
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.kinematics.grasp_state import GraspState
@@ -81,14 +78,11 @@ def test_the_slope_of_j_m_along_the_state_is_that_of_differences(motion: Contact
 def test_a_batch_is_its_states(motion: ContactMotion) -> None:
     model, state = motion.model, motion.state
     contacts = model.contacts(state)
-    names = ("point", "normal", "gap", "finger_curvature", "object_curvature")
-    both = contacts.replace(**{name: torch.stack([getattr(contacts, name)] * 2) for name in names})
-    away = torch.stack([state.q, state.q + 0.01])
-    states = GraspState(away, *(torch.stack([x, x]) for x in (state.position, state.rotation)))
-    found = model.linearize(states, both).manipulation_jacobian
-    for k in range(2):
-        one = model.linearize(GraspState(away[k], state.position, state.rotation), contacts)
-        torch.testing.assert_close(found[k], one.manipulation_jacobian, atol=1e-9, rtol=0)
+    states = [state, dataclasses.replace(state, q=state.q + 0.01)]
+    found = model.linearize(batch_of(*states), stacked(contacts, contacts)).manipulation_jacobian
+    for k, one in enumerate(states):
+        alone = model.linearize(one, contacts).manipulation_jacobian
+        torch.testing.assert_close(found[k], alone, atol=1e-9, rtol=0)
 
 
 def test_figures_that_are_learned_are_factors_of_the_arms(motion: ContactMotion) -> None:

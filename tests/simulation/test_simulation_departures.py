@@ -1,14 +1,15 @@
-"""Pulleys that are not round, springs that are not linear, cables with losses, pads that give way."""
+"""Tendons, couplings, springs and friction without a physics engine, and what a plant may have instead."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
-from torch_ekm.description import load_hand
+from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.simulation import PlantParameters, SimulatedHand
 from torch_ekm.simulation.mechanism.assembly import make_transmission
 from torch_ekm.simulation.mechanism.departures import CableLosses, JointShape
@@ -18,16 +19,27 @@ from torch_ekm.simulation.sensors import Sensors
 HAND = load_hand("icub_right")
 N_Q, STIFFNESS = HAND.n_q, 4.0
 ARMED = np.flatnonzero(HAND.actuation_jacobian.any(axis=0))
+TENDON = np.array([actuator.tendon for actuator in HAND.actuators])
 ROUND, NO_LOSSES = JointShape(np.zeros(N_Q), np.zeros(N_Q), 0.0), CableLosses(0.0, 0.0, 0.0, np.zeros(N_Q))
 
 
-def make(shape: JointShape = ROUND, losses: CableLosses = NO_LOSSES) -> Transmission:
-    actuators = tuple(dataclasses.replace(actuator, stiffness=STIFFNESS) for actuator in HAND.actuators)
-    real = dataclasses.replace(HAND, actuators=actuators, joint_friction=np.zeros(N_Q))
-    return Transmission(real, 0.0, shape, losses)
+def make(
+    shape: JointShape = ROUND,
+    losses: CableLosses = NO_LOSSES,
+    *,
+    hand: HandDescription = HAND,
+    stiffness: float = STIFFNESS,
+    friction: float = 0.0,
+    creep: float = 0.0,
+    **changes: Any,
+) -> Transmission:
+    actuators = tuple(dataclasses.replace(actuator, stiffness=stiffness) for actuator in hand.actuators)
+    changes |= {"actuators": actuators, "joint_friction": np.full(N_Q, friction)}
+    return Transmission(dataclasses.replace(hand, **changes), creep, shape, losses)
 
 
 def flexed(seed: int = 0) -> np.ndarray:
+    """A posture that the couplings allow."""
     part = np.random.default_rng(seed).uniform(0.2, 0.6, N_Q)
     return coupled_posture(HAND.coupling) @ (HAND.joint_lower + part * (HAND.joint_upper - HAND.joint_lower))
 
@@ -74,7 +86,7 @@ def test_a_slack_tendon_neither_pushes_nor_shares_its_slack() -> None:
     transmission = make(losses=dataclasses.replace(NO_LOSSES, coupling=0.2))
     q = flexed()
     motor = taut(transmission, q, 0.05)
-    pulling = np.flatnonzero([actuator.tendon for actuator in HAND.actuators])
+    pulling = np.flatnonzero(TENDON)
     assert len(pulling) > 1
     motor[pulling[0]] -= 1.0
     pulls = transmission.actuator_torque(q, motor)
@@ -155,9 +167,9 @@ def test_fingertips_scale_and_drift() -> None:
     assert np.abs(rate).max() > 0.02
 
 
-def at_rest(**figures: float) -> tuple[float, float, int]:
+def at_rest(engine: str = "sapien", **figures: float) -> tuple[float, float, int]:
     """A grasp of the box: force of the thumb [N], depth of its pad in the box [mm], fingers that touch."""
-    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters(**figures))
+    plant = SimulatedHand("icub_right", "box", parameters=PlantParameters(**figures), engine=engine)
     seen = plant.reset(seed=0)
     assert seen.truth is not None
     from torch_ekm.model import KinematicModel
@@ -180,10 +192,11 @@ def test_the_planner_knows_the_plant(figures) -> None:
     assert force == pytest.approx(5.0, abs=0.6)
 
 
-def test_pads_give_way_by_force_over_stiffness() -> None:
-    force, depth, _ = at_rest(contact_stiffness=5e3)
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_pads_give_way_by_force_over_stiffness(engine: str) -> None:
+    force, depth, _ = at_rest(engine, contact_stiffness=5e3)
     assert depth == pytest.approx(1e3 * force / 5e3, rel=0.15)
-    assert abs(at_rest()[1]) < 0.1
+    assert abs(at_rest(engine)[1]) < 0.2
 
 
 def test_one_side_of_the_object_has_less_friction() -> None:
@@ -215,3 +228,76 @@ def test_a_law_of_ones_own_adds_its_torques_and_each_grasp_has_a_copy_of_it() ->
     law = -0.1 * q + plain.actuator_torque(q, motor) @ HAND.actuation_jacobian * 0.5
     np.testing.assert_allclose(torque(own, q, motor), torque(plain, q, motor) + law, atol=1e-12)
     assert (own.law.calls, mine.calls) == (1, 0)
+
+
+def test_couplings_hold_for_the_joints_that_lead():
+    S = coupled_posture(HAND.coupling)
+    np.testing.assert_allclose(HAND.coupling @ S, 0.0, atol=1e-12)
+    np.testing.assert_allclose(S @ S, S, atol=1e-12)
+    assert S[HAND.joint_names.index("index_0"), HAND.joint_names.index("index_0")] == 1.0
+
+
+def test_a_slack_tendon_does_not_push_and_a_looped_cable_does():
+    transmission, q = make(), flexed(1)
+    motor = taut(transmission, q, 0.0)
+    distal, proximal = HAND.actuator_names.index("index_distal"), HAND.actuator_names.index("index_proximal")
+    motor[[distal, proximal]] -= 0.2
+    torques = transmission.actuator_torque(q, motor)
+    assert torques[distal] == 0.0
+    assert torques[proximal] == pytest.approx(-0.8)
+    j2 = HAND.joint_names.index("index_2")
+    spring = -HAND.spring_stiffness[j2] * (q[j2] - HAND.spring_rest[j2])
+    assert torque(transmission, q, motor)[j2] == pytest.approx(spring)
+
+
+def test_friction_holds_up_to_its_torque_and_no_further():
+    transmission, smooth, q = make(friction=0.02), make(), flexed(2)
+    joint, motor = HAND.joint_names.index("thumb_1"), taut(smooth, q, 0.05)
+    transmission.relax(q)
+    for offset, expected in ((0.001, 0.003), (0.02, 0.02), (0.2, 0.02), (0.19, -0.01), (0.1, -0.02)):
+        moved = q.copy()
+        moved[joint] += offset
+        resisting = torque(smooth, moved, motor)[joint] - torque(transmission, moved, motor)[joint]
+        assert resisting == pytest.approx(expected, abs=1e-9)
+
+
+def test_lengthened_tendons_slacken_and_cables_do_not():
+    transmission, q = make(), flexed(3)
+    motor = taut(transmission, q)
+    before = transmission.stretch(q, motor)
+    transmission.lengthen(0.03)
+    np.testing.assert_allclose(before - transmission.stretch(q, motor), 0.03 * TENDON, atol=1e-12)
+
+
+def test_creep_follows_the_load():
+    transmission, q = make(creep=0.01), flexed(4)
+    transmission.age(q, taut(transmission, q), duration=5.0)
+    grown = transmission.offset - HAND.actuator_offset
+    np.testing.assert_allclose(grown, 0.01 * 5.0 * 0.4 * TENDON, atol=1e-9)
+
+
+def test_a_new_tendon_takes_over_the_torque_of_the_old():
+    old, q = make(), flexed(5)
+    new = make(actuation_jacobian=1.3 * HAND.actuation_jacobian, stiffness=2.0)
+    motor = taut(old, q)
+    new.take_over(old, q, motor)
+    np.testing.assert_allclose(torque(new, q, motor), torque(old, q, motor), atol=1e-12)
+    assert np.abs(torque(new, q, motor + 0.1) - torque(old, q, motor + 0.1)).max() > 0.1
+
+
+def test_couplings_hold_from_the_rest_on():
+    """Followers that do not rest where leaders do."""
+    rest = np.zeros(N_Q)
+    rest[HAND.joint_names.index("ring_0")], rest[HAND.joint_names.index("little_1")] = 0.1, -0.05
+    hand = dataclasses.replace(HAND, spring_rest=rest)
+    transmission, other = make(hand=hand), make(hand=hand, stiffness=2.0)
+    assert np.abs(hand.coupling @ rest).max() > 0.04
+    away = rest + coupled_posture(hand.coupling) @ np.full(N_Q, 0.2)
+    for q in (rest, away):
+        motor = hand.actuator_offset + hand.actuation_jacobian @ q
+        np.testing.assert_allclose(transmission.stretch(q, motor), 0, atol=1e-12)
+        springs = -hand.spring_stiffness * (q - rest)
+        np.testing.assert_allclose(torque(transmission, q, motor), springs, atol=1e-12)
+    other.take_over(transmission, away, motor + 0.1)  # without a jolt
+    same = torque(other, away, motor + 0.1), torque(transmission, away, motor + 0.1)
+    np.testing.assert_allclose(*same, atol=1e-9)

@@ -60,21 +60,6 @@ def test_the_kinematic_model_predicts_both_alike() -> None:
     assert max(errors.values()) < 0.05, errors
 
 
-def test_one_seed_gives_one_run_and_a_snapshot_goes_back() -> None:
-    fresh = []
-    for _ in range(2):
-        plant = mujoco_hand(parameters=preset("nominal"))
-        plant.reset(5)
-        fresh.append(plant.command(CLOSER))
-    kept, restored = plant.snapshot(), []
-    for _ in range(2):
-        plant.restore(kept)
-        restored.append(plant.command(CLOSER))
-    for first, second in (fresh, restored):
-        assert torch.equal(first.position, second.position)
-        assert torch.equal(first.q, second.q)
-
-
 def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
     """A free planar finger: ``K_s (q - q0) = J_a^T k_a (m - a0 - J_a q)``."""
     plant = SimulatedHand("planar_two_finger", "can", engine="mujoco")
@@ -92,19 +77,6 @@ def test_two_springs_and_a_tendon_are_where_the_forces_say() -> None:
     rig.follow(np.zeros((1, 2)), np.zeros(1))
     rig.wait(2.0)
     np.testing.assert_allclose(rig.scene.q, hand.spring_rest, atol=1e-3)
-
-
-def test_soft_pads_give_way_by_force_over_stiffness() -> None:
-    """The thumb's pad sinks in by f/k: in by so much more than a hard one."""
-    depths = {}
-    for stiffness in (0.0, 5e3):
-        plant = mujoco_hand(parameters=preset("none").replace(contact_stiffness=stiffness))
-        plant.reset(3)
-        data = plant._grasped().scene._data  # type: ignore[attr-defined]
-        depths[stiffness] = max(-data.contact[k].dist for k in range(data.ncon))
-        force = float(plant._grasped().normal[0])
-    assert depths[0.0] < 2e-4
-    assert 0.3 * force / 5e3 < depths[5e3] < 3 * force / 5e3
 
 
 def test_friction_holds_until_its_cone() -> None:

@@ -122,17 +122,6 @@ def test_a_target_that_is_no_angle_is_refused(env):
         env.reset(options={"angel": 0.1})
 
 
-def test_it_is_vectorised():
-    envs = gymnasium.make_vec(ID, num_envs=2, vectorization_mode="sync", hand="planar_two_finger")
-    first, _ = envs.reset(seed=[0, 1])
-    again, _ = envs.reset(seed=[1, 1])
-    assert first.shape == (2, 16)
-    assert not np.array_equal(first[0], first[1])
-    assert np.array_equal(again[0], again[1])
-    assert np.array_equal(again[1], first[1])
-    envs.close()
-
-
 def test_it_draws_the_object_in_the_hand():
     pytest.importorskip("pyvista")
     code = f"""

@@ -30,9 +30,7 @@ OTHER = PlantParameters(
 )
 
 
-@pytest.fixture(
-    scope="module", params=[("box", PlantParameters()), ("can", PlantParameters()), ("box", OTHER)]
-)
+@pytest.fixture(scope="module", params=[("can", PlantParameters()), ("box", OTHER)])
 def grasp(request):
     """The model is told what the plant is, be it as described or not."""
     name, parameters = request.param
@@ -82,24 +80,12 @@ def motion_error(plant, linear, actuators) -> float:
     return float(np.linalg.norm(predicted - measured) / np.linalg.norm(predicted))
 
 
-DISTAL = ("thumb_distal", "index_distal", "middle_distal")
-
-
-@pytest.mark.parametrize(
-    ("name", "stiff", "gravity", "bound", "stiffness"),
-    [  # measured .004; .035 at 8 N m/rad
-        ("planar_two_finger", ("left", "right"), (0, -9.81, 0), 0.01, np.inf),
-        ("planar_two_finger", ("left", "right"), (0, -9.81, 0), 0.01, 1e6),
-        # .0135; .047; described as it is .0098, the time step's part
-        ("icub_right", DISTAL, None, 0.015, np.inf),
-    ],
-)
-def test_a_hand_with_rigid_actuators_moves_as_it_is_described(name, stiff, gravity, bound, stiffness):
-    hand = with_stiffness(load_hand(name), stiff, stiffness)
-    plant = SimulatedHand(hand, "box", PlantConfig(gravity=gravity))
+@pytest.mark.parametrize("stiffness", [np.inf, 1e6])
+def test_a_hand_with_rigid_actuators_moves_as_it_is_described(stiffness):
+    hand = with_stiffness(load_hand("planar_two_finger"), ("left", "right"), stiffness)
+    plant = SimulatedHand(hand, "box", PlantConfig(gravity=(0, -9.81, 0)))
     linear = KinematicModel(plant.hand, plant.object).linearize(plant.reset(0).truth.state)
-    used = [k for k, actuator in enumerate(hand.actuators) if not actuator.posture]
-    assert motion_error(plant, linear, used) < bound
+    assert motion_error(plant, linear, [0, 1]) < 0.01  # measured .004; .035 at 8 N m/rad
 
 
 def test_rigid_actuators_are_as_stiff_whatever_their_gear_and_need_small_steps():

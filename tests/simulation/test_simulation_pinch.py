@@ -1,4 +1,4 @@
-"""Planned pinches against an independent account of contacts, forces and torques."""
+"""Planned pinches against an independent account of contacts and forces; what would make one hold."""
 
 from __future__ import annotations
 
@@ -123,13 +123,6 @@ def test_requests_are_met():
     straight = plan_for("box")[2].rotation[:, 0]
     between = np.arccos(np.clip(straight @ plan.rotation[:, 0], -1, 1))
     assert between == pytest.approx(np.hypot(0.05, 0.05), abs=0.03)
-
-
-def test_weaker_springs_bend_the_fingertips_back():
-    stiff, weak = (plan_for("box", spring=spring)[2].q for spring in (1.0, 0.6))
-    hand = load_hand("icub_right")
-    j2, j3 = (hand.joint_names.index(f"thumb_{k}") for k in (2, 3))
-    assert weak[j3] - weak[j2] > stiff[j3] - stiff[j2] + 3 * DEG
 
 
 def test_a_pinch_across_another_axis_is_not_passed_off_as_the_wanted_one(tmp_path, monkeypatch):

@@ -22,12 +22,17 @@ def command(servo, delta, seed=0):
     return servo.encoder
 
 
-def test_a_faultless_servo_goes_where_it_is_told():
-    np.testing.assert_allclose(command(make(), [0.1, -0.2, 0.0]), [0.6, 0.3, 0.5])
-
-
-def test_limits_stop_it():
-    np.testing.assert_allclose(command(make(), [5.0, -5.0, 0.0]), [1.5, 0.0, 0.5])
+@pytest.mark.parametrize(
+    ("faults", "delta", "goes"),
+    [
+        ({}, [0.1, -0.2, 0.0], [0.6, 0.3, 0.5]),
+        ({}, [5.0, -5.0, 0.0], [1.5, 0.0, 0.5]),
+        ({"dead_zone": 0.02}, [0.05, -0.05, 0.015], [0.53, 0.47, 0.5]),
+    ],
+    ids=["as told", "to its limits", "short of it"],
+)
+def test_where_a_servo_goes(faults, delta, goes):
+    np.testing.assert_allclose(command(make(**faults), delta), goes)
 
 
 def test_bias_drifts_relative_to_the_encoder_and_does_not_on_the_setpoint():
@@ -46,11 +51,6 @@ def test_fresh_error_is_bounded_seeded_and_drawn_anew():
     np.testing.assert_array_equal(command(servo, np.zeros(3), seed=1), first)
     servo.place(np.full(3, 0.5))
     assert not np.array_equal(command(servo, np.zeros(3), seed=2), first)
-
-
-def test_coulomb_dead_zone_stops_short():
-    a = command(make(dead_zone=0.02), [0.05, -0.05, 0.015])
-    np.testing.assert_allclose(a, [0.53, 0.47, 0.5])
 
 
 def test_small_increments_pile_up_on_the_setpoint_but_never_on_the_encoder():
