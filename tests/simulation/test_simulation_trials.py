@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 
+import numpy as np
 import pytest
 
 from torch_ekm.description import load_hand, load_object
@@ -31,6 +32,27 @@ def test_a_change_holds_and_half_of_it_does_not():
     with pytest.raises(EquilibriumError, match=r"the fingertips reach it; torque is to blame: joint '\w+_1'"):
         plan(SOFT, CAN, (5.0 * force) ** 0.5)
     plan(dataclasses.replace(SOFT, spring_stiffness=1.03 * stiffer * SOFT.spring_stiffness), CAN)
+
+
+@pytest.mark.parametrize("figure", ["spring", "arm"])
+def test_the_error_says_which_spring_or_arm_the_joint_needs(figure):
+    with pytest.raises(EquilibriumError) as failed:
+        plan(SOFT, CAN)
+    told = r"'left_1' .* spring of ([\d.]+) N m/rad, not 0.025, or an arm of 'left' below ([\d.]+), not 0.8"
+    spring, arm = map(float, re.search(told, str(failed.value)).groups())
+
+    def changed(by):
+        springs, arms = SOFT.spring_stiffness.copy(), SOFT.actuation_jacobian.copy()
+        last = [name.endswith("_1") for name in SOFT.joint_names]
+        if figure == "spring":
+            springs[last] = spring * by
+        else:
+            arms[:, last] = np.where(arms[:, last], arm / by, 0.0)
+        return dataclasses.replace(SOFT, spring_stiffness=springs, actuation_jacobian=arms)
+
+    plan(changed(1.1), CAN)
+    with pytest.raises(EquilibriumError):
+        plan(changed(0.8), CAN)
 
 
 def test_an_object_that_is_too_wide_is_told_how_wide_it_may_be():

@@ -12,6 +12,7 @@ from .pinch_problem import PinchGeometry, PinchProblem
 _INSIDE = 0.5e-3  # [m] of a link in the object
 _APART = 0.2e-3  # [m] between pad and object
 _OFF = 1e-3  # [N m], as the planner's tolerance
+_BENT = 0.05  # [rad] of a joint from its rest, below which no spring helps
 
 
 class BorneProblem(PinchProblem):
@@ -65,6 +66,7 @@ def blame_torque(problem: PinchProblem, g: PinchGeometry) -> str:
         return (
             f"{reach}; torque is to blame: joint '{name}' of finger '{finger}' is "
             f"{1e3 * abs(off[joint]):.1f} mN m out of balance, where the contact asks {1e3 * asked:.1f} mN m"
+            + _would_need(problem, g, joint, float(off[joint]))
         )
     if pushed := problem.slack(g):
         return f"{reach}; torque is to blame: tendon {' and '.join(map(repr, pushed))} would be slack"
@@ -77,6 +79,29 @@ def blame_torque(problem: PinchProblem, g: PinchGeometry) -> str:
     ):
         return f"{reach} in balance; its range is to blame: the best takes actuator {beyond}"
     return f"{reach}; torque is to blame: the joints are in balance only in bad postures"
+
+
+def _would_need(problem: PinchProblem, g: PinchGeometry, joint: int, off: float) -> str:
+    """The spring or the arm with which the joint is in balance as it stands; empty: none does it."""
+    hand, found = problem.hand, []
+    change = -off / problem.passive_share(joint)  # of the torque of this joint alone
+    bent, spring = float(g.q[0, joint] - hand.spring_rest[joint]), float(hand.spring_stiffness[joint])
+    if spring and abs(bent) > _BENT and (stiffer := spring + change / bent) > 0:
+        found.append(f"a spring of {stiffer:.2g} N m/rad, not {spring:.2g}")
+    arms, load = problem.transmission.arms(g.q).reshape(-1, hand.n_q), problem.joint_load(g)[0]
+    pulling = np.flatnonzero(arms[:, joint])
+    others = np.flatnonzero(arms[pulling[0]]) if len(pulling) == 1 else np.zeros(0, int)
+    others = others[others != joint]
+    if len(others):
+        own = arms[pulling[0]]
+        tension = float(own[others] @ load[others] / (own[others] @ own[others]))
+        arm = load[joint] / tension if tension else 0.0
+        if arm * own[joint] > 0:
+            motor = hand.actuators[pulling[0]]
+            way = "below" if abs(arm) < abs(own[joint]) else "above"
+            arm, now = (abs(one) * motor.unit for one in (arm, own[joint]))
+            found.append(f"an arm of '{motor.name}' {way} {arm:.2g}, not {now:.2g}")
+    return f"; it would need {', or '.join(found)}" if found else ""
 
 
 def _motor_text(at: float, unit: float) -> str:

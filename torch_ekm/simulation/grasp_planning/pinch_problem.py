@@ -342,14 +342,14 @@ class PinchProblem:
 
     def tension(self, g: PinchGeometry) -> Array:
         """Torque of each actuator along ``+a`` that balances the joints, ``(batch, n_a)`` [N m]."""
-        load = self._joint_load(g)
+        load = self.joint_load(g)
         if self._constant:
             return load @ self._to_tension.T
         return self._reactions(g, load)[0][:, : self.hand.n_a]
 
     def _unheld(self, g: PinchGeometry) -> Array:
         """What of the joint load neither actuators nor loops nor couplings bear ``(batch, n_q)`` [N m]."""
-        load = self._joint_load(g)
+        load = self.joint_load(g)
         if self._constant:
             return load  # the passive motions are at right angles to all that is borne
         found, rows = self._reactions(g, load)
@@ -360,6 +360,10 @@ class PinchProblem:
         off = np.zeros_like(g.torque)
         off[:, self.moving] = self._unheld(g)[:, self.moving] @ self._passive @ self._passive.T
         return off
+
+    def passive_share(self, joint: int) -> float:
+        """How much of a torque at one joint nothing bears, 0 to 1."""
+        return float(np.square(self._passive[self.moving == joint]).sum())
 
     def slack(self, g: PinchGeometry) -> list[str]:
         """Tendons that would have to push, by name."""
@@ -376,7 +380,7 @@ class PinchProblem:
         found = np.linalg.pinv(rows.swapaxes(-1, -2), rcond=1e-9) @ (load @ self._free)[..., None]
         return found[..., 0], rows
 
-    def _joint_load(self, g: PinchGeometry) -> Array:
+    def joint_load(self, g: PinchGeometry) -> Array:
         """What springs and contacts ask of the tendons, for moment arms J_a, ``(batch, n_q)`` [N m]."""
         T = self.transmission
         inner = g.q + T.lean(g.torque)
