@@ -101,7 +101,8 @@ def _in_processes(
     threads = str(max((os.cpu_count() or 1) // n, 1))
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     env = {name: os.environ.get(name, threads) for name in names}
-    env["PYTHONWARNINGS"] = "ignore:a process in the background compiles loops"  # no news of a job
+    no_news = "ignore:a process in the background compiles loops"  # of a job
+    env["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), no_news)))
     pool = loky.ProcessPoolExecutor(n, env=env, initializer=_end_with, initargs=(os.getpid(),))
     try:
         running = {pool.submit(function, *arguments): name for name, arguments in jobs.items()}

@@ -88,7 +88,7 @@ def reason_table(trials: DataFrame) -> Table:
     """Why the turns of each controller ended, and how far from the target."""
 
     def cell(turns: DataFrame) -> str:
-        error = turns["survivor_error_deg"].astype(float).mean()
+        error = turns["true_error_deg"][~turns["lost"]].astype(float).mean()
         return f"{len(turns)}{'' if np.isnan(error) else f' ({error:.2f})'}"
 
     what = "why turns ended, and their mean true error [deg] where the object was not lost"
