@@ -218,11 +218,11 @@ def _last(turns: Frame) -> Frame:
     return back.groupby(["plant", "contender", "object", "seed"]).tail(1)
 
 
-def table(turns: Frame, by: str, columns: Sequence[str], name: str, title: str, note: str = "") -> Table:
+def table(turns: Frame, by: str, columns: Sequence[str], name: str, title: str) -> Table:
     """A row for each entry of a column."""
     items = {str(key): mine for key, mine in turns.groupby(by, sort=False)}
     cells = {Column(column, FIGURES[column].spec): FIGURES[column].of for column in columns}
-    return Table.of(name, title, by, items, cells, note)
+    return Table.of(name, title, by, items, cells)
 
 
 def ends_table(turns: Frame, by: str, split: str) -> Table:

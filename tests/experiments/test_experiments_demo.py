@@ -125,8 +125,11 @@ def test_new_objects_are_told_apart_from_the_turns_that_are_tested() -> None:
     told = new_table(trial_frame({"a": new, "b": [made_up_turn("KM", 3, 5, 9.0, "box")]}))
     assert [row[0] for row in told.rows] == ["can", "all"]
     row = dict(zip(told.header, told.rows[0], strict=True))
-    assert row["E-KM: motions"] == pytest.approx(sum(one.steps for one in new[2:]) / 2)
-    assert row["KM: error [deg]"] == pytest.approx(sum(one.true_error_deg for one in new[:2]) / 2)
+    for name, mine in (("KM", new[:2]), ("E-KM", new[2:])):
+        error, motions = (
+            sum(of) / 2 for of in zip(*((one.true_error_deg, one.steps) for one in mine), strict=True)
+        )
+        assert row[name] == f"{error:.2f}; {motions:.1f}"
 
 
 def test_results_are_named_by_the_model_that_is_run() -> None:

@@ -128,13 +128,12 @@ def check(
 @app.command()
 def notebooks(
     copy: Annotated[Path | None, Option(help="Copy them into this folder.")] = None,
-    overwrite: Annotated[bool, Option(help="Also over files that are there.")] = False,
 ) -> None:
     """List the notebooks of the package, or copy them."""
     from ..experiments.reporting.notebook import copy_notebooks, notebook_folder
 
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
-    for path in found if copy is None else copy_notebooks(copy, overwrite=overwrite):
+    for path in found if copy is None else copy_notebooks(copy):
         say(str(path))
     say_next("torch-ekm notebooks --copy DIR" if copy is None else f"jupyter lab {copy}")
 

@@ -144,8 +144,6 @@ def compare(
     with progress("comparing", len(data) * len(chosen), seconds) as advance:
         compared = run(streams, chosen, folder=out / "runs", processes=jobs, on_done=advance)
     print_report(compared.write(out), out, notes=True)
-    best = dict.fromkeys(compared.best(stream.name).learner for stream in compared.streams)
-    say(f"Best:      {', '.join(best)}")
     say_next("EnhancedModel(f, learner) in your loop; the call of each name: docs/how_to/choose_a_learner.md")
 
 

@@ -6,12 +6,13 @@ use, and they take lambdas and classes of a notebook.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -101,17 +102,24 @@ def _in_processes(
     threads = str(max((os.cpu_count() or 1) // n, 1))
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     env = {name: os.environ.get(name, threads) for name in names}
-    env["PYTHONWARNINGS"] = "ignore:a process in the background compiles loops"  # no news of a job
+    no_news = "ignore:a process in the background compiles loops"  # of a job
+    env["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), no_news)))
     pool = loky.ProcessPoolExecutor(n, env=env, initializer=_end_with, initargs=(os.getpid(),))
+    left, running = iter(jobs.items()), dict[Future, str]()
     try:
-        running = {pool.submit(function, *arguments): name for name, arguments in jobs.items()}
-        for future in as_completed(running):
-            try:
-                with _named(running[future]):
-                    result = future.result()
-            except loky.process_executor.TerminatedWorkerError:
-                raise WorkerDiedError from None
-            yield running[future], result
+        while True:
+            for name, arguments in itertools.islice(left, n - len(running)):  # others can be cancelled
+                running[pool.submit(function, *arguments)] = name
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                name = running.pop(future)
+                try:
+                    with _named(name):
+                        result = future.result()
+                except loky.process_executor.TerminatedWorkerError:
+                    raise WorkerDiedError from None
+                yield name, result
     finally:
         pool.shutdown(kill_workers=True)
 

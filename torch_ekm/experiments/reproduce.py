@@ -97,7 +97,7 @@ def write_report(experiment: Experiment, trials: DataFrame, folder: Path) -> Rep
     report.empty = not (trials["motions"] > 0).any()
     if report.empty:  # errors and ratios of turns that nobody made mean nothing
         report.summary, report.figures = f"Nothing was turned. {why(trials)}", []
-        report.tables = [table for table in report.tables if table.name == "stop_reasons"]
+        report.tables = [table for table in report.tables if table.name == "by_reason"]
     report.summary += f" {protocol}."
     if experiment.quick:
         report.title += ": a quick run"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -17,9 +17,9 @@ from ...rendering import Captions, make_scene, save_animation, save_picture
 from ..config import digest
 from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
-from ..reporting.report import Cell, Column, FigureFile, Report, Table
+from ..reporting.report import FigureFile, Report, Table
 from ..reporting.statistics import DataFrame
-from ..reporting.tables import error_table
+from ..reporting.tables import error_table, pivot
 from ..reporting.trials import select
 from ..runner import Bench, new_objects
 from .generalize import Generalize
@@ -72,7 +72,7 @@ class Demo(Generalize):
         report, turns = super().report(seeds, trials, folder), select(trials, kind="turn")
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
-        shown = ("stop_reasons", "controllers")
+        shown = ("by_reason", "controllers")
         leading = [error_table(turns, "angle_deg"), *([new_table(trials)] if self.new else [])]
         report.tables = leading + [table for table in report.tables if table.name in shown]
         report.leading = len(leading)
@@ -126,21 +126,13 @@ class Demo(Generalize):
 
 
 def new_table(trials: DataFrame) -> Table:
-    """How each controller turns objects that the hand has never held."""
+    """How each controller turns objects that the hand has never held; the E-KM has learned the hand."""
 
-    def mean(name: str, figure: str) -> Callable[[DataFrame], Cell]:
-        return lambda mine: float(mine[mine["controller"] == name][figure].mean())
+    def cell(turns: DataFrame) -> str:
+        return f"{turns['error_deg'].mean():.2f}; {turns['motions'].mean():.1f}"
 
-    figures = (("error [deg]", "error_deg", ".2f"), ("motions", "motions", ".1f"))
-    columns = {
-        Column(f"{name}: {what}", spec): mean(name, figure)
-        for what, figure, spec in figures
-        for name in ("KM", "E-KM")
-    }
-    note = "One seed: means of the turns. The E-KM has learned the hand with the first object."
-    made = select(trials, kind="new")
-    items = {str(name): mine for name, mine in made.groupby("object", sort=False)} | {"all": made}
-    return Table.of("new_objects", "Objects that the hand has never held", "object", items, columns, note)
+    what = "new to the hand, one seed; mean steady-state error [deg], and motions"
+    return pivot(select(trials, kind="new"), "controller", "object", cell, what)
 
 
 def _spoken(name: str) -> str:

@@ -22,18 +22,17 @@ def notebook_folder() -> Path:
     raise DescriptionError(package, "the notebooks are missing from this installation; install it again")
 
 
-def copy_notebooks(folder: Path, *, overwrite: bool = False) -> list[Path]:
+def copy_notebooks(folder: Path) -> list[Path]:
     """Copy all notebooks into ``folder`` (made if it is not there) and return the copies' paths.
 
     Raises:
-        DescriptionError: one of them is there already and ``overwrite`` is not set; nothing is copied.
+        DescriptionError: one of them is there already; nothing is copied.
     """
     sources = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     copies = [folder / source.name for source in sources]
     present = [copy.name for copy in copies if copy.exists()]
-    if present and not overwrite:
-        problem = "would be overwritten; name another folder, or use --overwrite"
-        raise DescriptionError(folder, f"{', '.join(present)} {problem}")
+    if present:
+        raise DescriptionError(folder, f"{', '.join(present)} would be overwritten; name another folder")
     if folder.exists() and not folder.is_dir():
         raise DescriptionError(folder, "this is a file; name a folder")
     make_folder(folder)

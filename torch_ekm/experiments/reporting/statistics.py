@@ -26,11 +26,9 @@ def unit_means(trials: DataFrame, column: str) -> Series:
     return trials[column].astype(float).groupby([trials["object"], trials["seed"]]).mean().dropna()
 
 
-def paired_means(
-    ours: DataFrame, theirs: DataFrame, ours_column: str, theirs_column: str | None = None
-) -> tuple[Array, Array]:
+def paired_means(ours: DataFrame, theirs: DataFrame, column: str) -> tuple[Array, Array]:
     """Unit means of two groups of trials, for the units that both have."""
-    a, b = unit_means(ours, ours_column), unit_means(theirs, theirs_column or ours_column)
+    a, b = unit_means(ours, column), unit_means(theirs, column)
     units = a.index.intersection(b.index)
     return a[units].to_numpy(), b[units].to_numpy()
 

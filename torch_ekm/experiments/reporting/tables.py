@@ -10,7 +10,6 @@ from ..._extras import require
 from ...control import StopReason
 from ...typing import Array
 from ..config import CONTROLLERS, FIRST_REPORTED
-from ..records import NOT_GRASPED
 from . import statistics as stats
 from .report import Cell, Column, Table
 from .statistics import LEAST_SEEDS, DataFrame, Estimate
@@ -87,20 +86,13 @@ def error_table(trials: DataFrame, split: str) -> Table:
 
 def reason_table(trials: DataFrame) -> Table:
     """Why the turns of each controller ended, and how far from the target."""
-    turns = trials[trials["kind"] == "turn"]
-    names = [name for name in CONTROLLERS if (turns["controller"] == name).any()]
-    rows: list[list[Cell]] = []
-    for reason in [*(reason.value for reason in StopReason), NOT_GRASPED]:
-        mine = turns[turns["reason"] == reason].groupby("controller")["survivor_error_deg"]
-        if not len(mine):
-            continue
-        count, mean = mine.size(), mine.mean()
-        errors = {name: "" if np.isnan(mean[name]) else f" ({mean[name]:.2f})" for name in count.index}
-        cells = [f"{count[name]}{errors[name]}" if name in errors else "-" for name in names]
-        rows.append([reason, *cells])
-    columns = ["reason", *(f"{name}: turns (error [deg])" for name in names)]
-    note = "Turns, and in brackets the mean true error at their end; none of lost objects."
-    return Table("stop_reasons", "Why the turns ended", columns, rows, note)
+
+    def cell(turns: DataFrame) -> str:
+        error = turns["true_error_deg"][~turns["lost"]].astype(float).mean()
+        return f"{len(turns)}{'' if np.isnan(error) else f' ({error:.2f})'}"
+
+    what = "why turns ended, and their mean true error [deg] where the object was not lost"
+    return pivot(trials[trials["kind"] == "turn"], "controller", "reason", cell, what)
 
 
 def ratio(trials: DataFrame, theirs: str) -> Estimate | None:

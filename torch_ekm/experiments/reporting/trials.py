@@ -24,7 +24,6 @@ def trial_frame(results: Mapping[str, Iterable[TrialRecord]]) -> DataFrame:
     job, grasped            of which job; whether a pinch held the object
     lost, not_reached       as in :class:`~torch_ekm.experiments.records.TrialRecord`
     error_deg               steady-state error: true error at the end; of a lost object the whole angle
-    survivor_error_deg      the same, of objects that were not lost
     motions                 their number
     prediction_km, ...      mean over the motions of ``prediction_km_deg``, ...; NaN where there is none
     ======================  ===============================================================================
@@ -55,7 +54,6 @@ def _added(record: TrialRecord) -> dict[str, Any]:
         "lost": record.lost,
         "not_reached": record.not_reached,
         "error_deg": abs(record.angle_deg) if record.lost else record.true_error_deg,
-        "survivor_error_deg": math.nan if record.lost else record.true_error_deg,
         "motions": record.steps if record.grasped else math.nan,
         **{name: float(np.mean(errors)) if errors else math.nan for name, errors in made.items()},
     }
