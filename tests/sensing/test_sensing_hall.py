@@ -188,19 +188,16 @@ def encoders(hand, q, generator, std=0.5 * DEG):
     return a + std * torch.randn(a.shape, generator=generator, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("stuck", [{}, {4: 255.0}], ids=["sound", "index_2 stuck"])
-def test_joint_estimates_of_a_whole_hand(hand, generator, monkeypatch, stuck):
-    """The encoder of index_distal covers index_2 with index_3."""
+def test_joint_estimates_of_a_whole_hand(hand, generator, monkeypatch):
     monkeypatch.setattr(joint_estimator, "ENCODER_STD", 0.5 * DEG)
     monkeypatch.setattr(joint_estimator, "ARM_STD", 0.0)
     sensors = HallSensors(hand, seed=1)
-    sensors.stuck.update(stuck)
     estimator = JointEstimator(hand, calibrated(sensors))
     q = random_posture(hand, 400, generator)
     estimate = estimator(sensors.read(q, generator), encoders(hand, q, generator))
     error = estimate.q - q
     rms = error.square().mean(0).sqrt() / DEG
-    assert float(rms.max()) < (1.2 if stuck else 0.7)  # those without a channel, too
+    assert float(rms.max()) < 0.7  # also the joints that have no channel: thumb_0 and the abductions
     moving = torch.from_numpy(hand.joint_upper - hand.joint_lower) > 1e-3
     chi2 = (error / estimate.std).square().mean(0)[moving]
     assert bool(((chi2 > 0.4) & (chi2 < 2.0)).all())
@@ -218,6 +215,19 @@ def test_wrong_moment_arms_do_not_draw_joints_that_have_channels(hand, generator
     mean = error.mean(0).abs()
     for joint in ("index_2", "index_3", "middle_2", "middle_3", "thumb_2", "thumb_3"):
         assert float(mean[hand.joint_names.index(joint)]) < 0.2
+
+
+def test_encoders_stand_in_for_a_stuck_channel(hand, generator, monkeypatch):
+    monkeypatch.setattr(joint_estimator, "ENCODER_STD", 0.5 * DEG)
+    monkeypatch.setattr(joint_estimator, "ARM_STD", 0.0)
+    sensors = HallSensors(hand, seed=1)
+    sensors.stuck[4] = 255.0  # index_2, which the encoder of index_distal covers with index_3
+    estimator = JointEstimator(hand, calibrated(sensors))
+    q = random_posture(hand, 200, generator)
+    estimate = estimator(sensors.read(q, generator), encoders(hand, q, generator))
+    k = hand.joint_names.index("index_2")
+    assert float((estimate.q - q)[:, k].square().mean().sqrt()) < 1.2 * DEG
+    assert float(estimate.std[:, k].mean()) < 1.2 * DEG
 
 
 def test_a_saturated_channel_holds_what_cables_get_wrong(hand, generator):

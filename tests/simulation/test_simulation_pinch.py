@@ -259,7 +259,7 @@ def plan(hand, obj, force=5.0):
 UNHURRIED = 1e4  # [s] of search: a slow machine finds the same
 
 
-def test_a_change_of_figures_holds_and_a_smaller_one_does_not(monkeypatch):
+def test_a_change_of_figures_holds_and_half_of_it_does_not(monkeypatch):
     monkeypatch.setattr(pinch, "_GUESSES", 1)
     monkeypatch.setattr(doctor, "_TRIED", 4)
     cure = doctor.smallest_changes(SOFT, CAN, PlantConfig(), PlantParameters(), UNHURRIED)
@@ -270,7 +270,7 @@ def test_a_change_of_figures_holds_and_a_smaller_one_does_not(monkeypatch):
     assert arm is not None
     plan(SOFT, CAN, 0.97 * float(force[1]))
     with pytest.raises(EquilibriumError, match=r"the fingertips reach it; torque is to blame: joint '\w+_1'"):
-        plan(SOFT, CAN, 1.15 * float(force[1]))
+        plan(SOFT, CAN, (5.0 * float(force[1])) ** 0.5)
 
     arms = SOFT.actuation_jacobian.copy()
     for row, joint in enumerate(arm.groups()[1:]):
