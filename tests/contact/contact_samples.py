@@ -17,7 +17,7 @@ def tangential(normal: torch.Tensor, curvature: float) -> torch.Tensor:
     return curvature * (torch.eye(3, dtype=F64) - normal[..., :, None] * normal[..., None, :])
 
 
-def ball_contacts(directions, *, friction=0.6, gamma=0.0, tip=0.006, centre=(0.0, 0.0, 0.0)) -> ContactSet:
+def ball_contacts(directions, *, friction=0.6, gamma=0.0) -> ContactSet:
     normal = torch.tensor(directions, dtype=F64)
     normal = normal / normal.norm(dim=-1, keepdim=True)
     n_c = len(normal)
@@ -25,10 +25,10 @@ def ball_contacts(directions, *, friction=0.6, gamma=0.0, tip=0.006, centre=(0.0
     return ContactSet(
         finger=names,
         link=names,
-        point=torch.tensor(centre, dtype=F64) + RADIUS * normal,
+        point=RADIUS * normal,
         normal=normal,
         gap=torch.zeros(n_c, dtype=F64),
-        finger_curvature=tangential(normal, 1 / tip),
+        finger_curvature=tangential(normal, 1 / 0.006),
         object_curvature=tangential(normal, 1 / RADIUS),
         friction=torch.full((n_c,), friction, dtype=F64),
         torsional_friction=torch.full((n_c,), gamma, dtype=F64),

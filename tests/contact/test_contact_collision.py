@@ -41,8 +41,8 @@ SHAPES = {
 DEPTH = {"box": 0.015, "cylinder": 0.02, "sphere": 0.025, "capsule": 0.015}  # from side to middle
 
 
-def thing(kind: str, size: tuple[float, ...] | None = None) -> ObjectDescription:
-    shape = Shape(kind, size or SHAPES[kind], np.eye(4))  # type: ignore[arg-type]
+def thing(kind: str) -> ObjectDescription:
+    shape = Shape(kind, SHAPES[kind], np.eye(4))  # type: ignore[arg-type]
     return dataclasses.replace(BOX, name=kind, shapes=(shape,))
 
 
@@ -285,7 +285,7 @@ def test_margin() -> None:
 # -- the whole hand -----------------------------------------------------------------------------
 
 
-def pinch(object_name: str, dtype: torch.dtype = F64, **options):
+def pinch(object_name: str, **options):
     """The object between thumb, index and middle finger, moved onto the thumb."""
     hand, obj = load_hand("icub_right"), load_object(object_name)
     kinematics = HandKinematics(hand)
@@ -302,7 +302,7 @@ def pinch(object_name: str, dtype: torch.dtype = F64, **options):
     rotation = torch.stack([x, y, torch.linalg.cross(x, y)], dim=-1)
     position = thumb + y * (obj.grasp_width / 2 + RADIUS)
     detector = ContactDetector(hand, obj, kinematics=kinematics, **options)
-    return detector, q.to(dtype), position.to(dtype), rotation.to(dtype)
+    return detector, q, position, rotation
 
 
 @pytest.mark.parametrize("name", ["box", "toothpaste"])

@@ -28,11 +28,7 @@ URDF_FAULTS = {
     "malformed": ('<robot name="planar_two_finger">', "<robot", "not well-formed XML"),
     "not a robot": ("robot", "world", "root element must be <robot>, found <world>"),
     "limits": ('lower="-0.5" upper="1.5"', 'lower="1.5" upper="-0.5"', "joint 'left_0'.*limits reversed"),
-    "nan": (
-        'lower="-0.5"',
-        'lower="nan"',
-        "joint 'left_0', limit: 'lower' must be a finite number, got 'nan'",
-    ),
+    "nan": ('lower="-0.5"', 'lower="nan"', "'left_0', limit: 'lower' must be a finite number, got 'nan'"),
     "two numbers": ('xyz="-0.03 0 0"', 'xyz="-0.03 0"', "must be three numbers, got '-0.03 0'"),
     "no limit": ("<limit ", "<bounds ", "joint 'left_0': <joint> needs a <limit>"),
     "type": ('type="revolute"', 'type="screw"', "type 'screw' is not supported; supported: revolute"),
@@ -41,17 +37,9 @@ URDF_FAULTS = {
     "no name": ('<link name="left_tip"/>', "<link/>", "a <link> has no name"),
     "no shape": ("<cylinder ", "<tube ", "<geometry> needs one of box, cylinder, sphere, capsule, mesh"),
     "zero axis": ('<axis xyz="0 0 -1"/>', '<axis xyz="0 0 0"/>', "axis must not be zero"),
-    "mass": (
-        'mass value="0.1"',
-        'mass value="-0.1"',
-        "link 'hand': the mass must not be negative",
-    ),
+    "mass": ('mass value="0.1"', 'mass value="-0.1"', "link 'hand': the mass must not be negative"),
     "size": ('<cylinder radius="0.006"', '<cylinder radius="0"', "size of a cylinder must be positive"),
-    "unknown parent": (
-        '<parent link="hand"/>',
-        '<parent link="wrist"/>',
-        "unknown link 'wrist'; links are: hand",
-    ),
+    "unknown parent": ('<parent link="hand"/>', '<parent link="wrist"/>', "unknown link 'wrist'; .*: hand"),
     "loop": ('<parent link="hand"/>', '<parent link="left_tip"/>', "one tree"),
     "twice": ('<link name="left_tip"/>', '<link name="hand"/>', "repeated: hand"),
 }
@@ -70,11 +58,7 @@ def test_urdf_faults(fault: str, files: tuple[Path, Path]) -> None:
 
 TRANSMISSION_FAULTS = {
     "malformed": ("[hand]", "[hand", "not well-formed TOML"),
-    "unknown key": (
-        "tendon = true",
-        "tendons = true",
-        r"\[\[actuators\]\] 'left': unknown key 'tendons'; valid keys",
-    ),
+    "unknown key": ("tendon = true", "tendons = true", r"\[\[actuators\]\] 'left': unknown key 'tendons'; v"),
     "unknown table": ("[hand]", "[hands]", "unknown key 'hands'"),
     "couplings of none": ("[hand]", "couplings = 3\n[hand]", r"'couplings' must be written as \[\[coup"),
     "not a bool": ("tendon = true", "tendon = 1", "'tendon' must be true or false, got 1"),

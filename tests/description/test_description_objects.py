@@ -62,15 +62,6 @@ def test_the_box_by_hand() -> None:
     np.testing.assert_array_equal(box.com, 0.0)
 
 
-def test_the_counter_weight_moves_the_centre_of_mass() -> None:
-    """80 g at 0 and 40 g at 30 mm: centre at 10 mm."""
-    box, weighted = load_object("box"), load_object("weighted_box")
-    assert weighted.mass == pytest.approx(0.12)
-    np.testing.assert_allclose(weighted.com, [0.01, 0, 0], atol=1e-12)
-    assert weighted.inertia[1, 1] > box.inertia[1, 1]
-    assert weighted.shapes[0].size == box.shapes[0].size
-
-
 def test_a_cylinder_with_two_balls_is_a_capsule() -> None:
     at = np.eye(4)
     up, down = np.eye(4), np.eye(4)

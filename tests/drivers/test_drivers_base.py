@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from no_bus import FakeDriver
-from wirings import T42, write
+from wirings import DEG, T42, radians, write
 
 from torch_ekm.drivers import MarkerPose, Sighting, WithPose
 from torch_ekm.exceptions import (
@@ -26,16 +26,10 @@ from torch_ekm.exceptions import (
 from torch_ekm.kinematics import ActuationMap
 from torch_ekm.plant import Plant, PlantStatus
 
-DEG = math.pi / 180
-
 
 @pytest.fixture
 def driver(tmp_path) -> FakeDriver:
     return FakeDriver(write(tmp_path))
-
-
-def radians(*values: float) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def test_units_signs_zeros_and_the_clock(driver) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from wirings import T42, write
+from wirings import DEG, T42, radians, write
 
 pytest.importorskip("dynamixel_sdk")
 
@@ -26,7 +26,6 @@ from spoiling import Spoiler
 from torch_ekm.drivers import DynamixelPlant
 from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
 
-DEG = math.pi / 180
 TICK = 2 * math.pi / 4096
 
 
@@ -38,10 +37,6 @@ def bus():
 
 def open_at(bus: DynamixelBus, folder: Path, **changes: str) -> DynamixelPlant:
     return DynamixelPlant(write(folder, port=bus.port, **changes))
-
-
-def radians(*values: float) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def test_a_motion_over_the_bus(bus, tmp_path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import time
 
 import numpy as np
@@ -13,7 +12,7 @@ from motors import Motors
 from no_bus import FakeDriver
 from test_drivers_yarp import increment
 from test_drivers_yarp import wiring as yarp_wiring
-from wirings import write
+from wirings import DEG, write
 from yarp_golden import GoldenYarp
 
 from torch_ekm.drivers import Sighting, WithPose, YarpPlant
@@ -21,7 +20,6 @@ from torch_ekm.exceptions import BusError, CommandRefusedError, EKMError, StaleR
 from torch_ekm.plant import Path, can_follow
 from torch_ekm.testing import check_following_plant
 
-DEG = math.pi / 180
 SLOW = 60 * DEG
 
 

@@ -15,7 +15,7 @@ import torch
 pytest.importorskip("rclpy", reason="rclpy is not here: source a ROS 2, or install the extra 'ros2'")
 
 from far_end import BUSES, End
-from wirings import of_page, write
+from wirings import of_page, radians, write
 
 from torch_ekm.drivers import Ros2Plant, RosPose, WithPose
 from torch_ekm.exceptions import BusError, DescriptionError, StaleReadingError
@@ -63,10 +63,6 @@ def path(tmp_path) -> Path:
     path = tmp_path / "hand.toml"
     path.write_text(TEXT)
     return path
-
-
-def radians(*values: float) -> torch.Tensor:
-    return torch.tensor(values, dtype=torch.float64)
 
 
 def test_a_motion_a_pose_and_faults_over_ros(hand, path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import random
 import time
 from pathlib import Path
@@ -10,14 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 from spoiling import Spoiler
-from wirings import of_page, write
+from wirings import DEG, of_page, write
 from yarp_golden import GoldenYarp
 
 from torch_ekm.description import load_hand
 from torch_ekm.drivers import YarpPlant
 from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
 
-DEG = math.pi / 180
 ICUB = load_hand("icub_right")
 
 

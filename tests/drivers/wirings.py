@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
+
+import torch
+
+DEG = math.pi / 180
 
 T42 = """\
 [hand]
@@ -31,6 +36,10 @@ rate_deg = 200
 still_for = 0.05
 timeout = 0.5
 """
+
+
+def radians(*values: float) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
 
 
 def of_page(driver: str) -> str:

@@ -140,19 +140,19 @@ def test_casadi_says_the_same_while_it_learns(name: str) -> None:
     assert g.parameters().shape == (g.n_parameters,)
 
 
+class Flat(SquaredExponential):
+    """No subclass counts as its base."""
+
+    def phi(self, d2: torch.Tensor) -> torch.Tensor:
+        return torch.ones_like(d2)
+
+
 def test_casadi_names_what_it_cannot_say() -> None:
     pytest.importorskip("casadi", reason="extra 'interop'")
+    kernel = DeepKernel(Flat(1), hidden=(2,), features=1)
+    with pytest.raises(ParameterError, match=r"Flat.*no subclass"):
+        to_casadi(SparseOnlineGP(1, 1, kernel=kernel))
     with pytest.raises(ParameterError, match="RecursiveLeastSquares"):
         to_casadi(RecursiveLeastSquares(3, 2))
     with pytest.raises(StateError, match="one model"):
         to_casadi(SparseOnlineGP(3, 2, batch_shape=(2,)))
-
-
-def test_casadi_takes_no_subclass_for_its_base() -> None:
-    class Flat(SquaredExponential):
-        def phi(self, d2: torch.Tensor) -> torch.Tensor:
-            return torch.ones_like(d2)
-
-    kernel = DeepKernel(Flat(1), hidden=(2,), features=1)
-    with pytest.raises(ParameterError, match=r"Flat.*no subclass"):
-        to_casadi(SparseOnlineGP(1, 1, kernel=kernel))

@@ -39,27 +39,26 @@ class Toy:
         detector = lambda q, o, R: self.solver.surfaces(q, o, R)  # noqa: E731
         return KinematicModel(hand, old.obj, old.options, kinematics=old.kinematics, detector=detector)
 
-    def recordings(self, steps=12, size=2e-4, play=None, force=True, seed=0):
+    def recordings(self, steps, play=None):
         """Random positions of the tendons around the start [m]; encoders are before the play."""
-        draw = np.random.default_rng(seed)
+        draw = np.random.default_rng(0)
         at, observations = self.at, []
         motor = at.a.clone()
         play = Play(torch.zeros(3, dtype=F64)) if play is None else play
         state = play.at(torch.zeros(3, dtype=F64))
         for k in range(steps + 1):
             if k:
-                goal = self.at.a + torch.from_numpy(draw.uniform(-size, size, 3)) / self.toy.unit
+                goal = self.at.a + torch.from_numpy(draw.uniform(-2e-4, 2e-4, 3)) / self.toy.unit
                 moved, state = play.advance(state, goal - motor)
                 motor, at = goal, self.solver.moved(at, at.a + moved)
-            normal = self.solver.forces(at).normal if force else None
-            s = at.state
-            seen = {"q": s.q, "position": s.position, "rotation": s.rotation, "a": motor}
-            observations.append(SimpleNamespace(**seen, fingertip_force=normal, status="held"))
+            normal = self.solver.forces(at).normal
+            seen = {**vars(at.state), "a": motor, "fingertip_force": normal, "status": "held"}
+            observations.append(SimpleNamespace(**seen))
         return [SimpleNamespace(observations=observations)]
 
-    def wrong(self, seed=0):
+    def wrong(self):
         """Springs, arms and stiffnesses each off by 10 to 30 %."""
-        draw = np.random.default_rng(seed)
+        draw = np.random.default_rng(0)
 
         def factor(*shape):
             return 1 + draw.uniform(0.1, 0.3, shape) * draw.choice([-1, 1], shape)

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from torch_ekm.description import list_hands, load_hand, load_object, write_template
-from torch_ekm.description.registry import hand_paths
 from torch_ekm.description.urdf import read_urdf
 from torch_ekm.exceptions import DescriptionError, EKMError
 from torch_ekm.kinematics.se3 import exp
@@ -156,13 +155,3 @@ def test_a_mesh_only_hand(tmp_path: Path) -> None:
     trimesh.creation.icosphere(radius=0.01).export(tmp_path / "tip.stl")
     urdf.write_text(urdf.read_text() + " ")  # changed: it is read again
     assert len(make_scene(*arguments).shapes) == 1
-
-
-@pytest.mark.parametrize("name", list_hands())
-def test_hands_of_the_package_look_like_what_touches(name: str) -> None:
-    hand = load_hand(hand_paths(name)[0])
-    found = visuals(hand.urdf)
-    assert found.problems == ()
-    for link in hand.urdf.links:
-        looks = sorted((shape.kind, shape.size) for shape in found.of_link[link.name])  # type: ignore[union-attr]
-        assert looks == sorted((shape.kind, shape.size) for shape in link.collisions)

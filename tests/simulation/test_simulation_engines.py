@@ -18,7 +18,6 @@ from torch_ekm.simulation import SimulatedHand, preset
 
 pytest.importorskip("mujoco")
 DEG = np.pi / 180
-CLOSER = torch.tensor([0.02, 0.0, 0.01, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 
 def angle(first: Observation, second: Observation) -> float:

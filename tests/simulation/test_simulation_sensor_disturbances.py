@@ -26,7 +26,6 @@ SENSOR_DISTURBANCES = {
     "frame_loss": 0.5,
     "stuck_joints": ("index_3",),
 }
-SEEN_IN = {"joint_noise": "q", "stuck_joints": "q", "force": "fingertip_force"}
 
 
 def rolled(plant):
