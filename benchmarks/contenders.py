@@ -14,12 +14,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sessions import axes_of
+
 from torch_ekm.contact.contact_kinematics import ContactKinematics
 from torch_ekm.control import (
     DEFAULT_TASKS,
     ActuatorLimit,
     ClosedLoop,
+    Direction,
     EffortTask,
+    FocusedPose,
     FocusTask,
     Guards,
     LimitingFunction,
@@ -74,6 +78,14 @@ class UnwatchedBench(Bench):
     """Movements go to their end."""
 
     loops = UnwatchedLoop
+
+
+class PlaceKept(Bench):
+    """The object's place along the grip is a second direction of the focus."""
+
+    def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
+        along = Direction(axes_of(self)["b"], "mm", tolerance=0.3)
+        return super().look_and_move(focus or FocusedPose([Direction(self.hand.rotation_axis, "deg"), along]))
 
 
 class PrintedController(LookAndMoveController):
@@ -240,6 +252,7 @@ BEGINNINGS = {
     "learned hand, f alone": Contender("E-KM", {"learner": "model alone"}),
     "empty": Contender("E-KM", {"adapts": False}),
 }
+PLACE = {"E-KM": Contender(), "place kept": Contender(bench=PlaceKept)}
 ORACLE = {"E-KM": Contender(), "oracle": Contender("KM+S", {}, OracleBench)}
 #: Readings replaced by the truth.
 READINGS = {

@@ -5,7 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, READINGS, WHOLE_TURNS, Contender
+from contenders import (
+    BEGINNINGS,
+    ORACLE,
+    PARTS,
+    PLACE,
+    PLAIN,
+    PLANS,
+    PRINTED,
+    READINGS,
+    WHOLE_TURNS,
+    Contender,
+)
 from matrix import Frame, Question, bands_table, learning_picture, table
 from sessions import TARGETS, directions, foresight, there_and_back, turns
 from slides import errors_picture, errors_table, slides, told
@@ -103,8 +114,8 @@ _ASKED = (
         objects=("tea_tin", "carton"), setting=Setting(), options=_TO_THE_END, columns=_ENDS, split="object",
     ),
     Question(
-        "series", "Turns without a new grasp", there_and_back, {"E-KM": Contender()},
-        options={"learns_by": (9.0, -9.0, 15.0), "angle": 15.0, "times": 20}, by="part", split="object",
+        "series", "Turns without a new grasp", there_and_back, PLACE,
+        options={"learns_by": (9.0, -9.0, 15.0), "angle": 15.0, "times": 20}, by="case", split="object",
         columns=(*_ENDS[:4], "along the grip, last [mm]", "contacts slid, last [mm]", "other ends"),
         short={"learns_by": (), "angle": 6.0, "times": 1},
     ),
