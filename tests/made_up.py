@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
 from torch_ekm.kinematics import se3
@@ -18,7 +20,7 @@ def trajectory(seed: int, n: int = 3, n_a: int = 2) -> Trajectory:
     seen = []
     for k in range(n + 1):
         image = torch.full((9, 8, 3), k).byte()
-        info = {
+        info: dict[str, Any] = {
             "raw": {"counts": torch.arange(4, dtype=torch.int32) + k, "image": image},
             "estimate": {"covariance": some(2, 2).float()},
         }

@@ -68,6 +68,7 @@ TRANSMISSION_FAULTS = {
     "reversed": ("range_deg = [0.0, 150.0]", "range_deg = [150.0, 0.0]", "range reversed"),
     "both units": ("range_deg = [0.0, 150.0]", "range_deg = [0.0, 150.0]\nrange = [0.0, 1.0]", "not both"),
     "three": ("range_deg = [0.0, 150.0]", "range_deg = [0.0, 1.0, 2.0]", "list of 2 numbers"),
+    "no range": ("range_deg = [0.0, 150.0]", "", "the key 'range' is missing"),
     "no arms": ("moment_arms = { left_0 = 1.0, left_1 = 0.8 }", "", "'moment_arms' is missing"),
     "rank": (
         "moment_arms = { left_0 = 1.0, left_1 = 0.8 }",

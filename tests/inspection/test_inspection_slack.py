@@ -209,7 +209,8 @@ def scanned():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no pseudo terminals")
-def test_a_scanned_bus_becomes_a_wiring_that_moves_the_hand(scanned, tmp_path) -> None:
+def test_a_scanned_bus_becomes_a_wiring_that_moves_the_hand(scanned, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("torch_ekm.drivers.dynamixel_port._PATIENCE_MS", 2000.0)  # the machine may be busy
     path = tmp_path / "my_hand.toml"
     words = ["drivers", "yale_t42", "--new", str(path), "--port", scanned.port, "--baud", "1000000"]
     done = CliRunner().invoke(app, words)
