@@ -35,7 +35,7 @@ def test_a_ghost_stands_where_it_was_planned_and_can_be_seen_through():
     q = hand.spring_rest[None]
     scene = make_scene(hand, obj, q, here, one, PALM_DOWN, ghost=(there, one))
     n = len(obj.shapes)
-    hidden = [scene.opacity(i) is None for i in range(len(scene.shapes))]
+    hidden = [scene.opacity(i) == 1.0 for i in range(len(scene.shapes))]
     assert hidden == [True] * (len(hidden) - n) + [False] * n
     moved = scene.transforms[0, -n:, :3, 3] - scene.transforms[0, -2 * n : -n, :3, 3]
     np.testing.assert_allclose(moved, [[0.01, 0, 0]] * n, atol=1e-12)
