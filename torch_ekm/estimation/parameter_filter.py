@@ -118,13 +118,13 @@ class ParameterFilter(Recorded, nn.Module):
         super().__init__()
         self.names, n = tuple(names), len(names)
 
-        def vector(name: str, values: object, default: float = 0.0) -> Tensor:
-            full = torch.full((n,), default) if values is None else torch.as_tensor(values)
+        def vector(name: str, values: Any, default: float = 0.0) -> Tensor:
+            full = torch.as_tensor([default] * n if values is None else values, dtype=torch.float64)
             if full.shape != (n,) or bool(full.isnan().any()):
                 raise ParameterError(name, values, f"{n} numbers, one for each of the names")
-            return full.double()
+            return full
 
-        covariance = torch.as_tensor(prior).double()
+        covariance = torch.as_tensor(prior, dtype=torch.float64)
         if covariance.dim() == 1:
             covariance = torch.diag(vector("prior", prior).square())
         good = covariance.shape == (n, n) and bool(covariance.isfinite().all())
