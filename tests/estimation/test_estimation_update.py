@@ -65,7 +65,7 @@ def test_a_surprise_is_one_on_average_where_the_noise_is_as_stated(draw) -> None
 
 def test_the_parameters_follow_the_recursion_of_their_docstring(draw) -> None:
     q, P_0, m_0 = 1e-3, np.diag([1.0, 4.0]), np.array([0.5, -0.25])
-    learner = ParameterFilter(["one", "two"], m_0.tolist(), [1.0, 2.0], [-2.0, -2.0], [1.2, 2.0])
+    learner = ParameterFilter(["one", "two"], m_0.tolist(), [1.0, 2.0], [-2.0, -2.0], [1.3, 2.0])
     m, P, usual, row, opened, at_bound = m_0, P_0, 1.0, 0, [], 0
     for k in range(60):
         phi, R = draw.normal(size=(M, 2)), np.array([0.01, 0.02, 0.01])
@@ -83,7 +83,7 @@ def test_the_parameters_follow_the_recursion_of_their_docstring(draw) -> None:
         R = R / weight
         K = np.linalg.solve(S + np.diag(R), phi @ P).T
         wanted = mean + K @ (r + phi @ (m - mean))
-        m = np.clip(wanted, [-2.0, -2.0], [1.2, 2.0])
+        m = np.clip(wanted, [-2.0, -2.0], [1.3, 2.0])
         left = np.eye(2) - K @ phi
         P = left @ P @ left.T + (K * R) @ K.T
         assert report.opened == (row == 0 and z > most)
