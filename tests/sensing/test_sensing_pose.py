@@ -89,8 +89,7 @@ def test_edges_correct_rough_corners(pose_of, camera, rng, monkeypatch):
 @pytest.mark.parametrize("shade", [40, 215])
 def test_edges_of_a_half_hidden_board_still_count(pose_of, rng, shade):
     camera, board, pose = PinholeCamera(), MarkerBoard(), pose_of(tilt_deg=30)
-    ends = np.array([[-0.03, 0.012, 0.33], [0.04, 0.02, 0.33]])
-    finger = ConvexBody(ends, np.full(2, 0.007), shade)
+    finger = ConvexBody(np.array([[-0.03, 0.012, 0.33], [0.04, 0.02, 0.33]]), np.full(2, 0.007), shade)
     image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, pose),), (finger,)), rng)
     found = estimate_board_pose(image, camera, board, corners(board, pose, camera))
     error = twist(found.rotation, found.position, pose)
