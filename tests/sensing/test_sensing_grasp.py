@@ -11,12 +11,12 @@ from fakes import FakePlant
 
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import ObjectLostError, ParameterError, StateError
-from torch_ekm.kinematics import HandKinematics
+from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, TrackStatus
 from torch_ekm.simulation import HallSensors, SensedPlant
-from torch_ekm.simulation.imaging.grasp_view import GraspView
+from torch_ekm.simulation.imaging.grasp_view import camera_facing, grasp_scene
 from torch_ekm.simulation.sensed_plant import ICUB_PALM_MOUNT
 
 DEG = np.pi / 180
@@ -71,8 +71,8 @@ class Puppet(FakePlant):
 def test_scene_is_the_grasp_seen_from_the_camera(hand, obj):
     palm, board = MarkerBoard(0, mount=ICUB_PALM_MOUNT), MarkerBoard(4, mount=obj.marker_transform)
     q, position, rotation = grasp(hand)
-    camera_pose = GraspView.facing(palm.mount, np.eye(4) + 0.05)
-    scene = GraspView(hand, obj, palm, board, camera_pose).scene(q, position, rotation)
+    camera_pose = camera_facing(palm.mount, np.eye(4) + 0.05)
+    scene = grasp_scene(hand, obj, (palm, board), camera_pose, GraspState(q, position, rotation))
     back = [camera_pose @ card.pose for card in scene.cards]
     np.testing.assert_allclose(back[0], ICUB_PALM_MOUNT, atol=1e-12)
     expected = np.eye(4)
@@ -88,7 +88,7 @@ def test_scene_is_the_grasp_seen_from_the_camera(hand, obj):
 
 def test_camera_faces_both_cards(obj, pose_of):
     palm, other = ICUB_PALM_MOUNT, pose_of(0.02, 0.04, 0.06, 70, 30, 10) @ np.diag([1.0, -1, -1, 1])
-    pose = GraspView.facing(palm, other)
+    pose = camera_facing(palm, other)
     middle = (palm[:3, 3] + other[:3, 3]) / 2
     np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
     assert np.linalg.det(pose[:3, :3]) == pytest.approx(1.0)
@@ -98,9 +98,9 @@ def test_camera_faces_both_cards(obj, pose_of):
     away = other.copy()
     away[:3, :3] = palm[:3, :3] @ np.diag([1.0, -1, -1])
     with pytest.raises(ParameterError, match="160 deg"):
-        GraspView.facing(palm, away)
+        camera_facing(palm, away)
     with pytest.raises(ParameterError, match="to the side"):
-        GraspView.facing(palm, palm)
+        camera_facing(palm, palm)
 
 
 def test_sensed_plant_knows_only_what_its_sensors_say(hand, obj):
@@ -203,10 +203,11 @@ def test_every_object_is_seen_over_the_range_of_turns(hand, name, turn, simulate
     q, position, rotation = grasp(hand)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, position
-    view = GraspView(hand, obj, palm, board, GraspView.facing(palm.mount, pose @ board.mount))
+    camera_pose = camera_facing(palm.mount, pose @ board.mount)
     q, position, rotation = grasp(hand, turn)
     tracker = MarkerTracker(simulated.camera, palm, board)
-    track = tracker.track(simulated.render(view.scene(q, position, rotation), rng))
+    scene = grasp_scene(hand, obj, (palm, board), camera_pose, GraspState(q, position, rotation))
+    track = tracker.track(simulated.render(scene, rng))
     assert track.ok
     assert (track.position - position).norm() < 1e-3
     assert log(track.rotation @ rotation.mT).norm() < 0.5 * DEG

@@ -62,8 +62,7 @@ def test_markers_are_found_where_they_were_drawn(pose_of, lens, rng):
         assert np.abs(found[0].mean(0) - truth[k - 8].mean(0)).max() < 0.2  # no half-pixel shift
 
 
-@pytest.mark.usefixtures("clean")
-def test_card_is_as_bright_as_its_print(pose_of, rng, monkeypatch):
+def test_card_is_as_bright_as_its_print(pose_of, rng, clean, monkeypatch):
     """Area and mean grey level of a drawn card are those of the geometry (coverage, not just sampling)."""
     board, pose = MarkerBoard(), pose_of(tilt_deg=20)
     for name, level in (("_BLACK", 0.0), ("_WHITE", 255.0), ("_BACKGROUND", 100.0)):
@@ -77,9 +76,8 @@ def test_card_is_as_bright_as_its_print(pose_of, rng, monkeypatch):
     assert (image - 100).sum() == pytest.approx(expected, rel=5e-3)
 
 
-@pytest.mark.usefixtures("clean")
 @pytest.mark.parametrize(("depth", "hidden"), [(0.30, True), (0.45, False)])
-def test_a_ball_hides_a_card_only_from_before(pose_of, rng, depth, hidden):
+def test_a_ball_hides_a_card_only_from_before(pose_of, rng, clean, depth, hidden):
     board, pose = MarkerBoard(), pose_of(tilt_deg=10)
     camera = SimulatedCamera()
     ball = ConvexBody(np.array([[0, 0, depth]]), np.array([0.01]), shade=77)
@@ -93,8 +91,7 @@ def test_a_ball_hides_a_card_only_from_before(pose_of, rng, depth, hidden):
         np.testing.assert_array_equal(image, free)
 
 
-@pytest.mark.usefixtures("clean")
-def test_cards_outside_or_behind_are_not_drawn(pose_of, rng):
+def test_cards_outside_or_behind_are_not_drawn(pose_of, rng, clean):
     camera = SimulatedCamera()
     empty = camera.render(CardScene(), rng)
     behind = pose_of()

@@ -222,7 +222,7 @@ def test_errors_say_what_would_be_right():
     with pytest.raises(UnknownNameError, match="box"):
         SimulatedHand("icub_right", "bocks")
     with pytest.raises(UnknownNameError, match="thumb"):
-        SimulatedHand("icub_right", "box", PlantConfig(thumb="toe"))
+        SimulatedHand("icub_right", "box", PlantConfig(fingers=("toe",)))
     with pytest.raises(GraspError, match="reset"):
         SimulatedHand("icub_right", "box").observe()
     with pytest.raises(ParameterError, match="9"):

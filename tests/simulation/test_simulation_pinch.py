@@ -185,7 +185,8 @@ def test_a_pad_on_the_side_of_the_one_that_opposes_is_idle(tmp_path):
     pads = tuple(dataclasses.replace(pad, name=f"pad {pad.name}") for pad in hand.pads)
     hand = dataclasses.replace(hand, pads=pads)
     assert opposing_pads(hand, PlantConfig())[0] == "pad thumb"
-    assert opposing_pads(hand, PlantConfig(thumb="pad index")) == ("pad index", ("pad thumb",))
+    pads = tuple(dataclasses.replace(pad, name=pad.name.replace("pad index", "thumb")) for pad in pads)
+    assert opposing_pads(dataclasses.replace(hand, pads=pads), PlantConfig()) == ("thumb", ("pad thumb",))
 
 
 def test_an_object_that_no_pinch_holds_is_refused_once(tmp_path, monkeypatch):

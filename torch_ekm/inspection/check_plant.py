@@ -203,7 +203,11 @@ class _Checked:
             if jacobian is not None:
                 predicted = jacobian[-6:] @ motion.a
                 along.append((predicted, pose))
-                rows += self._by_pose(i, predicted, pose)
+                if (
+                    not self.test.rows[i] and self._cosine(predicted, pose) <= -0.5
+                ):  # no joint sensor shows it
+                    found = "the object moves against what the model predicts: sign reversed"
+                    rows.append(self._wrong(i, found, "sign"))
             motions.append(replace(motion, gain=gain))
             if (
                 row is not None
@@ -267,12 +271,6 @@ class _Checked:
         self._gate.command(delta, by="check")
         return motion, None, pose
 
-    def _by_pose(self, i: int, predicted: Array, pose: Array) -> list[Check]:
-        """Where no joint sensor shows a motor's sign, the object does."""
-        if self.test.rows[i] or self._cosine(predicted, pose) > -0.5:
-            return []
-        return [self._wrong(i, "the object moves against what the model predicts: sign reversed", "sign")]
-
     def _frame(self, along: list[tuple[Array, Array]]) -> list[Check]:
         predicted, pose = (np.concatenate(list(part)) for part in zip(*along, strict=True))
         turns = np.tile([0.0] * 3 + [1.0] * 3, len(along))
@@ -307,7 +305,12 @@ class _Checked:
             or (not readings.motions and len(one[1]) == 1 and one[1][0].key == "id")
         ]
         if not alike or (len(alike[0][1]) > 1 and len(alike) > _ALIKE):
-            yield self._unexplained(readings)
+            off = readings.a - self.hand.unloaded(readings.q)
+            i = int(np.argmax(np.where(self.test.rows, np.abs(off), 0)))
+            by = f"{off[i] / _DEG:.3g} deg"
+            what = f"its encoder and the sensors of its joints differ by {by}, or move otherwise"
+            more = ", or the zeros of its joints; several entries may be wrong"
+            yield self._wrong(i, what, "zero", more)
             return
         for number, (_, mistakes) in enumerate(alike):
             name, what = mistakes[0].where, mistakes[0].what
@@ -325,14 +328,6 @@ class _Checked:
                 score = float(np.square(misfit).sum()) + sum(one.penalty for one in mistakes)
                 found.append((score, mistakes))
         return sorted(found, key=lambda one: one[0])
-
-    def _unexplained(self, readings: Readings) -> Check:
-        off = readings.a - self.hand.unloaded(readings.q)
-        i = int(np.argmax(np.where(self.test.rows, np.abs(off), 0)))
-        found = (
-            f"its encoder and the sensors of its joints differ by {off[i] / _DEG:.3g} deg, or move otherwise"
-        )
-        return self._wrong(i, found, "zero", ", or the zeros of its joints; several entries may be wrong")
 
     def _constant(self, motions: tuple[Motion, ...]) -> Iterator[Check]:
         """Joint sensors that read the same, bit by bit, while motors moved: left out from here on."""

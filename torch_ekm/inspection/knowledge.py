@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -67,41 +66,29 @@ def _date(file: Path) -> str:
 
 def estimates(knowledge: HandKnowledge) -> list[Estimated]:
     """All figures of a :class:`~torch_ekm.control.HandKnowledge`, part by part."""
-    return [*_servo(knowledge), *_forces(knowledge), *_figures(knowledge), *_error(knowledge)]
-
-
-def _servo(knowledge: HandKnowledge) -> Iterator[Estimated]:
-    servo = knowledge.servo
-    if not isinstance(servo, ServoModel):
-        return
-    for figure, values, stds in zip(
-        ("dead zone [deg]", "bias [deg]"), (servo.dead_zone, servo.bias), servo.standard_errors, strict=True
-    ):
-        for i, name in enumerate(servo.names):
-            note = "stuck" * bool(servo.stuck[i])
-            yield Estimated("servo", name, figure, float(values[i]) / _DEG, float(stds[i]) / _DEG, 0.0, note)
-
-
-def _forces(knowledge: HandKnowledge) -> Iterator[Estimated]:
-    forces = knowledge.forces
+    servo, forces, learned, error = knowledge.servo, knowledge.forces, knowledge.figures, knowledge.error
+    found = []
+    if isinstance(servo, ServoModel):
+        for figure, values, stds in zip(
+            ("dead zone [deg]", "bias [deg]"),
+            (servo.dead_zone, servo.bias),
+            servo.standard_errors,
+            strict=True,
+        ):
+            for name, value, std, stuck in zip(servo.names, values, stds, servo.stuck, strict=True):
+                note = "stuck" * bool(stuck)
+                found.append(
+                    Estimated("servo", name, figure, float(value) / _DEG, float(std) / _DEG, 0.0, note)
+                )
     for i, (scale, std) in enumerate(zip(forces.scale.tolist(), forces.scale_std.tolist(), strict=True)):
-        yield Estimated("forces", f"pad {i}", "of the model's answer", scale, std, 1.0, "")
-
-
-def _figures(knowledge: HandKnowledge) -> Iterator[Estimated]:
-    learned = knowledge.figures
-    if not isinstance(learned, HandFigures):
-        return
-    changed = {one.name: f"changed after {one.motion} motions" for one in learned.changes}
-    for one in learned.figures:
-        unit, figure = (_DEG, "width [deg]") if one.is_width else (1.0, "of its description")
-        note = changed.get(one.name, "" if one.identified else NOT_IDENTIFIED)
-        yield Estimated(
-            "figures", one.name, figure, one.factor / unit, one.std / unit, one.described / unit, note
-        )
-
-
-def _error(knowledge: HandKnowledge) -> Iterator[Estimated]:
-    error = knowledge.error
+        found.append(Estimated("forces", f"pad {i}", "of the model's answer", scale, std, 1.0, ""))
+    if isinstance(learned, HandFigures):
+        changed = {one.name: f"changed after {one.motion} motions" for one in learned.changes}
+        for one in learned.figures:
+            unit, figure = (_DEG, "width [deg]") if one.is_width else (1.0, "of its description")
+            note = changed.get(one.name, "" if one.identified else NOT_IDENTIFIED)
+            figures = (one.factor / unit, one.std / unit, one.described / unit)
+            found.append(Estimated("figures", one.name, figure, *figures, note))
     for name, share in (("along", error.along), ("across", error.across)):
-        yield Estimated("error", name, "share of a motion", share, None, None, "")
+        found.append(Estimated("error", name, "share of a motion", share, None, None, ""))
+    return found

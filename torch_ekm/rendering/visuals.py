@@ -44,7 +44,7 @@ class Visuals:
     """What is drawn for each link, and what could not be read."""
 
     of_link: dict[str, tuple[Shape | Mesh, ...]]
-    problems: tuple[str, ...] = ()
+    problems: tuple[str, ...]
 
 
 def visuals(urdf: UrdfModel) -> Visuals:
@@ -54,19 +54,14 @@ def visuals(urdf: UrdfModel) -> Visuals:
     for ``package://name/rest`` in the folders above it as ``name/rest`` and ``rest``. Pictures do without
     what is missing: a problem is listed, not raised.
     """
-    touched = Visuals({link.name: tuple(link.collisions) for link in urdf.links})
-    if urdf.path.suffix != ".urdf":
-        return touched
-    try:
-        changed = os.stat(urdf.path).st_mtime_ns
-    except OSError:  # a description that outlived its file
-        return touched
-    drawn, problems = _read(urdf.path.resolve(), changed)
-    meshes = {name: parts for (name, tag), parts in drawn.items() if tag == "collision"}
+    drawn: dict[tuple[str, str], tuple[Shape | Mesh, ...]] = {}
+    problems: tuple[str, ...] = ()
+    if urdf.path.suffix == ".urdf" and urdf.path.exists():  # else a description that outlived its file
+        drawn, problems = _read(urdf.path.resolve(), os.stat(urdf.path).st_mtime_ns)
     found: dict[str, tuple[Shape | Mesh, ...]] = {}
     for link in urdf.links:
-        parts = drawn.get((link.name, "visual"))
-        found[link.name] = parts or tuple(link.collisions) or meshes.get(link.name, ())
+        looks, touches = (drawn.get((link.name, tag), ()) for tag in ("visual", "collision"))
+        found[link.name] = looks or tuple(link.collisions) or touches
     return Visuals(found, problems)
 
 

@@ -24,11 +24,9 @@ class PlantConfig:
     """[s]; 2 ms is fine for long runs and the most with rigid actuators, 4 ms the most with soft ones."""
     pinch_force: float | None = None
     """Normal force of the thumb in the planned grasp [N]; None: the hand's."""
-    thumb: str | None = None
-    """Pad that opposes the others; None: the one whose name begins with "thumb", else the one that faces the
-    others best while the hand closes."""
     fingers: tuple[str, ...] | None = None
-    """Opposing pads; None: index and middle where there are both, else all others."""
+    """Pads that oppose the one whose name begins with "thumb", else the one that faces the others best while
+    the hand closes; None: index and middle where there are both, else all others."""
     along: tuple[float, float, float] | None = None
     """Direction in the hand of the object's long axis, within 5 deg, about which a pinch can turn it. None:
     the normal of a planar hand, else the axis about which most pads' last joints turn, or that of the hand

@@ -16,10 +16,10 @@ from ..sensing.joint_estimator import JointEstimator
 from ..sensing.vision.board import MarkerBoard
 from ..sensing.vision.track import Track
 from ..sensing.vision.tracker import MarkerTracker
-from ..typing import Tensor
+from ..typing import Array, Tensor
 from .hall_sensors import HallSensors
 from .imaging.card_scene import CardScene
-from .imaging.grasp_view import GraspView
+from .imaging.grasp_view import camera_facing, grasp_scene
 from .imaging.simulated_camera import SimulatedCamera
 
 _LOOKS = 5  # pictures tried for one observation
@@ -73,7 +73,7 @@ class SensedPlant(PlantWrapper):
             sweep = hall.sweep(181, torch.Generator().manual_seed(0))
             self.joints = JointEstimator(hand, HallCalibration.fit(*sweep, hall.joints))
         self._generator = torch.Generator()
-        self._view: GraspView | None = None
+        self._camera_pose: Array | None = None
         self._seed = self._frames = 0
         self._last: tuple[Tensor, Tensor, float] | None = None
 
@@ -88,8 +88,7 @@ class SensedPlant(PlantWrapper):
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = truth.rotation, truth.position
         palm, board = self.boards
-        camera_pose = GraspView.facing(palm.mount, pose @ board.mount)
-        self._view = GraspView(self.hand, self.object, palm, board, camera_pose)
+        self._camera_pose = camera_facing(palm.mount, pose @ board.mount)
         self._seed = int(np.random.SeedSequence([0, seed]).generate_state(1)[0])
         self._generator.manual_seed(self._seed)
         self._frames, self._last = 0, None
@@ -98,11 +97,11 @@ class SensedPlant(PlantWrapper):
 
     def observation(self, seen: Observation) -> Observation:
         """``seen`` with what camera and Hall sensors make of its truth in place of the readings."""
-        if self._view is None:
+        if self._camera_pose is None:
             raise StateError("there is no grasp yet: call reset(seed) first")
         truth = _truth_of(seen)
         shown = truth.state if truth.pictured is None else truth.pictured
-        scene = self._view.scene(shown.q, shown.position, shown.rotation)
+        scene = grasp_scene(self.hand, self.object, self.boards, self._camera_pose, shown)
         if seen.status is PlantStatus.NOT_SEEN:
             scene = scene.obstructed(1)
         track, image = self._look(scene)

@@ -22,7 +22,7 @@ from ..mechanism.assembly import chain, make_transmission, true_object
 from ..parameters import PlantParameters
 from .blame import BorneProblem, blame_geometry, blame_torque
 from .pinch_problem import PinchProblem, PinchRequest, opposition
-from .requirements import closes_pad, require_two_pads_and_limits, unmet
+from .requirements import closes_pad, direction_unmet, require_two_pads_and_limits
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
 _POSTURES = 4096  # random ones, of which the best are first guesses
@@ -92,19 +92,13 @@ def plan_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
     found = solve(problem, request)
     g = problem.geometry(found.x[None])
     if not found.holds:
-        raise EquilibriumError(
-            "pinch planner",
-            f"no posture within the limits holds '{problem.obj.name}' with {request.force:g} N",
-            pinch_hint(problem) or _blame(problem, request),
-        )
+        what = f"no posture within the limits holds '{problem.obj.name}' with {request.force:g} N"
+        raise EquilibriumError("pinch planner", what, pinch_hint(problem) or _blame(problem, request))
     if not found.across:
-        raise EquilibriumError(
-            "pinch planner",
-            "the only pinch found holds the object across another axis than its 'grasp_axis'",
-            pinch_hint(problem)
-            or f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
-            "for this hand: name the axis along which it is thin",
-        )
+        what = "the only pinch found holds the object across another axis than its 'grasp_axis'"
+        wide = f"'{problem.obj.name}' may be too wide along {problem.obj.grasp_axis.round(3).tolist()} "
+        wide += "for this hand: name the axis along which it is thin"
+        raise EquilibriumError("pinch planner", what, pinch_hint(problem) or wide)
     return PinchPlan(
         q=g.q[0],
         position=g.position[0],
@@ -158,8 +152,9 @@ def descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: 
 
 
 def pinch_hint(problem: PinchProblem) -> str:
-    """What the hand lacks for any pinch; empty if nothing is known."""
-    return "; ".join(map(str, unmet(problem)))
+    """What the pads lack for any pinch; empty if nothing is known."""
+    lacks = [(pad.name, direction_unmet(problem.hand, pad)) for pad in problem.pads]
+    return "; ".join(f"pad '{name}': {'; '.join(lack)}" for name, lack in lacks if lack)
 
 
 def _blame(problem: PinchProblem, request: PinchRequest) -> str:
@@ -216,7 +211,7 @@ def pinch_problem(
 def opposing_pads(hand: HandDescription, config: PlantConfig) -> tuple[str, tuple[str, ...]]:
     """Names of the pad that opposes the others, and of these."""
     names = [pad.name for pad in hand.pads]
-    thumb = config.thumb or next((name for name in names if name.startswith("thumb")), None)
+    thumb = next((name for name in names if name.startswith("thumb")), None)
     both = tuple(name for name in names if name.startswith(("index", "middle")))
     fingers = config.fingers or (both if len(both) >= min(2, len(names) - 1) else ())
     if thumb is None or not fingers:

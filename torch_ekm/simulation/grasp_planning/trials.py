@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...description import HandDescription, ObjectDescription
 from ...typing import Array
@@ -17,14 +18,8 @@ from .pinch_problem import PinchRequest
 _MOST = 1.6  # largest change: the log of a factor, [rad], or a share of a range
 _HALVINGS = 4  # between no change and the largest
 
-
-@dataclass(frozen=True)
-class Case:
-    """A hand, an object and a force."""
-
-    hand: HandDescription
-    obj: ObjectDescription
-    request: PinchRequest
+#: A hand, an object and a force [N].
+Case = tuple[HandDescription, ObjectDescription, float]
 
 
 def smallest_changes(
@@ -37,18 +32,18 @@ def smallest_changes(
     Args:
         hand, obj, config, parameters: as of the plant that cannot hold it.
     """
-    force = hand.pinch_force if config.pinch_force is None else config.pinch_force
 
     def pinch(case: Case, *guesses: Array) -> Array | None:
-        problem = pinch_problem(case.hand, case.obj, config, parameters)
-        found = solve(problem, case.request, guesses or None)
+        hand, obj, force = case
+        problem = pinch_problem(hand, obj, config, parameters)
+        found = solve(problem, PinchRequest(force), guesses or None)
         return found.x if found.holds and found.across else None
 
-    case = Case(hand, obj, PinchRequest(force))
+    case = hand, obj, hand.pinch_force if config.pinch_force is None else config.pinch_force
     if pinch(case) is not None:
         return ["fingertips centred on the object (spread = 0), as it is otherwise"]
     told = []
-    for changed, text in _changes(case):
+    for changed, text in _changes(*case, pinch_problem(hand, obj, config, parameters).moving):
         low, high = 0.0, _MOST
         if (x := pinch(changed(high))) is None:
             continue
@@ -56,39 +51,49 @@ def smallest_changes(
             middle = (low + high) / 2
             found = pinch(changed(middle), x)
             low, high, x = (middle, high, x) if found is None else (low, middle, found)
-        told.append(text(high))
+        told.append(text(high, x))
     return told
 
 
-def _changes(case: Case) -> Iterator[tuple[Callable[[float], Case], Callable[[float], str]]]:
-    """The case with a change of some size, and the change in words."""
-    hand, obj, request = case.hand, case.obj, case.request
+def _changes(
+    hand: HandDescription, obj: ObjectDescription, force: float, moving: NDArray[np.intp]
+) -> Iterator[tuple[Callable[[float], Case], Callable[[float, Array], str]]]:
+    """The case with a change of some size, and in words the change that gave a pinch."""
 
     def narrower(u: float) -> Case:
         s = float(np.exp(-u))
         shapes = tuple(one.scaled(s) for one in obj.shapes)
-        return replace(case, obj=replace(obj, shapes=shapes, grasp_width=s * obj.grasp_width))
-
-    def gentler(u: float) -> Case:
-        return replace(case, request=replace(request, force=request.force * float(np.exp(-u))))
+        return hand, replace(obj, shapes=shapes, grasp_width=s * obj.grasp_width), force
 
     def stiffer(u: float) -> Case:
-        return replace(case, hand=replace(hand, spring_stiffness=hand.spring_stiffness * np.exp(u)))
+        return replace(hand, spring_stiffness=hand.spring_stiffness * np.exp(u)), obj, force
 
     def freer(u: float) -> Case:
-        limits = {"joint_lower": hand.joint_lower - u, "joint_upper": hand.joint_upper + u}
-        return replace(case, hand=replace(hand, **limits))
+        return replace(hand, joint_lower=hand.joint_lower - u, joint_upper=hand.joint_upper + u), obj, force
 
     def longer(u: float) -> Case:
         motors = []
         for one in hand.actuators:
             by = u * (one.upper - one.lower)
             motors.append(replace(one, lower=one.lower - by, upper=one.upper + by))
-        return replace(case, hand=replace(hand, actuators=tuple(motors)))
+        return replace(hand, actuators=tuple(motors)), obj, force
+
+    def beyond(u: float, x: Array) -> str:
+        """Limits that the pinch exceeds."""
+        found = []
+        for joint, at in zip(moving.tolist(), x[: len(moving)].tolist(), strict=True):
+            edge = float(np.clip(at, hand.joint_lower[joint], hand.joint_upper[joint]))
+            if edge != at:
+                new, old = np.degrees([at, edge])
+                found.append(f"'{hand.joint_names[joint]}' at {new:.0f} deg, not {old:.0f}")
+        return f"limits of {' and '.join(found) or f'all joints {np.degrees(u):.0f} deg farther apart'}"
 
     width = 1e3 * obj.grasp_width
-    yield gentler, lambda u: f"a pinch_force of {request.force * np.exp(-u):.2g} N"
-    yield narrower, lambda u: f"an object {width * np.exp(-u):.1f} mm wide, not {width:.1f}"
-    yield stiffer, lambda u: f"springs {np.exp(u):.1f} times as stiff"
-    yield freer, lambda u: f"limits of the joints {np.degrees(u):.0f} deg farther apart at either end"
-    yield longer, lambda u: f"ranges of the actuators {100 * u:.0f} % longer at either end"
+    yield (
+        lambda u: (hand, obj, force * float(np.exp(-u))),
+        lambda u, _: f"a pinch_force of {force * np.exp(-u):.2g} N",
+    )
+    yield narrower, lambda u, _: f"an object {width * np.exp(-u):.1f} mm wide, not {width:.1f}"
+    yield stiffer, lambda u, _: f"springs {np.exp(u):.1f} times as stiff"
+    yield freer, beyond
+    yield longer, lambda u, _: f"ranges of the actuators {100 * u:.0f} % longer at either end"

@@ -64,7 +64,8 @@ class Transmission:
         losses: CableLosses,
         law: Callable[[Array, Array], Array] | None = None,
     ) -> None:
-        stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
+        self.stiffness = stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
+        """Series stiffness k_a of each actuator, ``(n_a,)`` [N m/rad]."""
         limits = hand.joint_lower, hand.joint_upper
         self.n_a, self.n_q = hand.n_a, hand.n_q
         self.J_a = hand.actuation_jacobian
@@ -145,11 +146,6 @@ class Transmission:
         """The excursion at which followers obey the couplings."""
         rest = self.shape.excursion(self.spring_rest)
         return rest + self._S @ (self.shape.excursion(q) - rest)
-
-    @property
-    def stiffness(self) -> Array:
-        """Series stiffness k_a of each actuator, ``(n_a,)`` [N m/rad]."""
-        return self._k[: self.n_a]
 
     def relax(self, q: Array) -> None:
         """Put the friction's anchors at ``q``: no friction torque, no hysteresis, joints amid their play."""
