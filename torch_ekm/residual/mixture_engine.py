@@ -20,7 +20,7 @@ from .sparse_gp.engine.loading import load_loops
 def warm_up() -> bool:
     """Load the compiled loops now, not at the first update; returns whether there are any (extra ``fast``).
 
-    A fresh installation compiles them first, for some ten seconds. Without this call another process does so
+    A fresh installation compiles them first, for about a minute. Without this call another process does so
     meanwhile, and torch does the work.
     """
     return load_loops(wait=True) is not None

@@ -20,9 +20,14 @@ from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
+from .sparse_gp.engine import numba_descent as steps
 from .sparse_gp.engine.numba_math import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
+from .sparse_gp.engine.numba_rebuild import rebuild_fleet as rebuild_fleet
+from .sparse_gp.engine.numba_units import pool_columns as pool_columns
 
 embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
+lead_fleet, arrive_fleet, descend_fleet = steps.lead_fleet, steps.arrive_fleet, steps.descend_fleet
+predict_queries, finish_step = steps.predict_queries, steps.finish_step
 
 
 @njit(types.void(I1, A3, I2, A2), **INNER)

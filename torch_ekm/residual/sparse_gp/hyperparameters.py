@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -20,11 +21,14 @@ from .part import Host, Part
 from .prequential_loss import PrequentialLoss, Queries
 
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
+BETAS = 0.9, 0.99  # of Adam
 # Adam's first step on parameters that are no logarithms: a deep kernel's weights
-_NETWORK_RATE = 0.015
+NETWORK_RATE = 0.015
 # the part of these that goes with each step, times the noise's share of y (and shrinking as steps do):
 # features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
-_NETWORK_DECAY = 0.25
+NETWORK_DECAY = 0.25
+LEAST, LEAST_NOISE, MOST = -7.0, -14.0, 7.0  # of logarithms: far beyond what standardised data can mean
+_SHORT = 8  # samples between two rebuilds from which on a step leaves the last one out
 
 
 class LearnHyperparameters(Part):
@@ -32,7 +36,8 @@ class LearnHyperparameters(Part):
 
         loss(theta) = mean_t -log p(y_t | x_t, (Omega, h)_{t0}, theta),   t = t0+1 .. t0+k
 
-    at every rebuild of the caches, k = ``refresh_every``. The k samples were not seen by the state of k
+    before every rebuild of the caches, k = ``refresh_every``, less the last sample: of one model a step is
+    made in parts, each with another sample. The k samples were not seen by the state of k
     samples ago, so the loss cannot be won by overfitting (:class:`PrequentialLoss`). Memory: one copy of the
     state and k samples. The streaming variational bound needs as much and is a worse objective: it inflates
     the noise.
@@ -49,8 +54,8 @@ class LearnHyperparameters(Part):
 
     Args:
         rate: Adam's first step on the logarithms of the hyperparameters.
-        steps: gradient steps per rebuild, spread over the samples up to it; the last one starts where the
-            others lead.
+        steps: gradient steps per rebuild, spread over the samples up to it; each starts where those before
+            lead.
         memory: samples of the past to learn from, too (at least 32); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
 
@@ -74,54 +79,67 @@ class LearnHyperparameters(Part):
         factor = 1.0 if fading is None else fading.factor
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
+        self.lead = int(self.window >= _SHORT)
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
         parameters = [*learner.kernel.hyperparameters().values(), learner.log_noise_variance]
-        self.adam = Adam(parameters, betas=(0.9, 0.99))
+        self.adam = Adam(parameters, betas=BETAS)
         for i, p in enumerate(parameters):
             self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
         # no more than what a learner remembers that forgets
         known = self.memory if factor == 1.0 else min(self.memory, math.ceil(1.0 / (1.0 - factor)))
-        size = max(self.window, known, learner.recent.capacity)
+        size = max(self.window + self.lead, known, learner.recent.capacity)
         fleet = {"batch_shape": fleet, "dtype": like.dtype, "device": like.device}
         learner.recent = Recent(learner.in_features, learner.out_features, size, **fleet)
-        self._n_rebuilt = 0
+        self._n_rebuilt, self._n_changes, self._leads = 0, 0, False
 
     def act(self, learner: Host) -> None:
         """Descend, and move the parameters, when it is time."""
-        place = (learner.n_samples - learner.refresh_offset) % self.window
-        due = learner.is_due(learner.n_samples + 1)
-        between = (place + 1) * self.steps // self.window > place * self.steps // self.window
-        if due or (between and place + 1 < self.window):
-            if moved := due and self.steps > 1:
-                self._move(learner)
-            self.descend(learner, moved=moved)
-        if due:
+        n = learner.n_samples + 1
+        if self._is_due(learner, n):
+            self.descend(learner)
+        elif learner.engine is not None and self.lead and self.memory:
+            for ahead in (1, 2):  # a large step in parts
+                if self._is_due(learner, n + ahead):
+                    since = self._n_rebuilt, self._n_changes, self._leads
+                    learner.engine.descend(learner, n + ahead - self.lead, since, until=3 - ahead)
+        if learner.is_due(n):
             self._move(learner)
+
+    def _is_due(self, learner: Host, n: int) -> bool:
+        """Whether there is a step after n samples."""
+        place, window = (n + self.lead - learner.refresh_offset - 1) % self.window, self.window
+        if place == window - 1:
+            return learner.is_due(n + self.lead)
+        return (place + 1) * self.steps // window > place * self.steps // window
 
     def after_rebuild(self, learner: Host) -> None:
         """The present state becomes the past one, which has seen all samples so far."""
         self.loss.snapshot(learner.posterior)
         self._n_rebuilt = learner.n_samples
+        self._n_changes += 1
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models face another system: the state of the old one does not count."""
         self.loss.state.forget(models)
+        self._n_changes += 1
 
     def reset(self) -> None:
         """Forget snapshot and step sizes."""
         super().reset()
         self.adam.reset()
         self.loss.state.reset()
-        self._n_rebuilt = 0
+        self._n_rebuilt, self._leads = 0, False
+        self._n_changes += 1
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Samples that the past state has seen."""
-        return {"n_rebuilt": self._n_rebuilt}
+        """Samples that the past state has seen, and whether steps lead away from it."""
+        return {"n_rebuilt": self._n_rebuilt, "leads": self._leads}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._n_rebuilt = int(state["n_rebuilt"])
+        self._n_rebuilt, self._leads = int(state["n_rebuilt"]), bool(state["leads"])
+        self._n_changes += 1
 
     def queries(self, learner: Host, n: int) -> Queries:
         """Of n samples those since the past state, and this turn's part of those that it has seen."""
@@ -129,54 +147,87 @@ class LearnHyperparameters(Part):
         x, y, _, weight = recent.last(n, min(max(n - self._n_rebuilt, 0), self.window))
         absorbed = age = x.new_zeros(x.shape[-2])
         if self.memory:
-            k = max(_REPLAYED * self.window, learner.posterior.capacity)
-            x_past, y_past, weight_past, age_past = recent.take(n, k)
+            x_past, y_past, weight_past, age_past = recent.take(n, self.replayed(learner))
             seen = (age_past > n - self._n_rebuilt).to(age_past.dtype)
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
+            seen = seen * (age_past < recent.capacity)  # the oldest one's place may be taken
             weight = torch.cat([weight, weight_past * seen], dim=-1)
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
         return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
-    def _theta(self, learner: Host) -> dict[str, Tensor]:
+    def replayed(self, learner: Host) -> int:
+        """Samples of the memory in a step."""
+        return max(_REPLAYED * self.window, learner.posterior.capacity) if self.memory else 0
+
+    def figures(self) -> tuple[float, float, float]:
+        """Rate of a step; square of a robust weight's threshold (0: none), factor of forgetting."""
+        return self.rate, (self.loss.robust or 0.0) ** 2, self.loss.forgetting_factor
+
+    def theta(self, learner: Host) -> dict[str, Tensor]:
+        """What is learned, by name."""
         return {**learner.kernel.hyperparameters(), "log_noise": learner.log_noise_variance}
 
-    def descend(self, learner: Host, *, moved: bool = False) -> None:
+    def descend(self, learner: Host) -> None:
         """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.
 
-        The parameters move at the next rebuild: until then the caches are those of the old ones. ``moved``:
-        those of the past state are to be made again.
+        It starts where the last ones lead. The parameters move at the next rebuild: until then the caches
+        are those of the old ones.
         """
-        kernel, log_noise, parameters = learner.kernel, learner.log_noise_variance, self._theta(learner)
-        queries = self.queries(learner, learner.n_samples + 1)
-        _, gradients = self.loss.with_gradients(kernel, log_noise, queries, anew=moved)
+        n, since = learner.n_samples + 1 - self.lead, (self._n_rebuilt, self._n_changes, self._leads)
+        if learner.engine is None or not learner.engine.descend(learner, n, since):
+            self._descend(learner, n)
+        self._leads = True
+
+    def _descend(self, learner: Host, n: int) -> None:
+        kernel, log_noise = learner.kernel, learner.log_noise_variance.clone()
+        if self._leads:  # another thread may query the kernel itself
+            kernel = copy.deepcopy(kernel)
+        parameters = {**kernel.hyperparameters(), "log_noise": log_noise}
+        if self._leads:
+            self._add(parameters)
+        queries = self.queries(learner, n)
+        _, gradients = self.loss.with_gradients(kernel, log_noise, queries, anew=self._leads)
         on = ((queries.weight * (1.0 - queries.absorbed)).sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
-        n = self.n_steps.clamp_min(1.0)
-        correction, decay = self.adam.correction(n) * _shrink(n), _NETWORK_DECAY * _shrink(n)
-        decay = decay * on * parameters["log_noise"].mean(-1).exp().clamp_max(1.0)
-        alone = on.is_cpu and not on.dim() and bool(on)  # one model, which needs no masks
-        if alone := alone and all(g is None or bool(g.isfinite().all()) for g in gradients):
-            correction, decay = float(correction), float(decay)
+        n_steps = self.n_steps.clamp_min(1.0)
+        correction, decay = self.adam.correction(n_steps) * _shrink(n_steps), NETWORK_DECAY * _shrink(n_steps)
+        decay = decay * on * log_noise.mean(-1).exp().clamp_max(1.0)
         for i, ((name, p), gradient) in enumerate(zip(parameters.items(), gradients, strict=True)):
             if gradient is None:
                 continue
-            logarithm = name.split(".")[-1].startswith("log_")
-            shared = self.shared_kernel and name != "log_noise"
-            good = None if alone else gradient.isfinite() & (_spread(on, p, shared) > 0)
-            rate = (self.rate if logarithm else _NETWORK_RATE) * _spread(correction, p, shared)
-            move = self.get_buffer(f"move_{i}")
-            if not logarithm:
+            shared, move = self.shared_kernel and name != "log_noise", self.get_buffer(f"move_{i}")
+            good = gradient.isfinite() & (_spread(on, p, shared) > 0)
+            rate = self.rate if is_logarithm(name) else NETWORK_RATE
+            if not is_logarithm(name):
                 move.sub_(_spread(decay, p, shared) * p)
-            self.adam.move(i, move, gradient if good is None else gradient.where(good, 0.0), rate, good)
+            step = rate * _spread(correction, p, shared)
+            self.adam.move(i, move, gradient.where(good, 0.0), step, good)
+
+    def moments(self, i: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the i-th parameter: its move at the next rebuild, and Adam's first and second moments."""
+        first, second = (self.adam.get_buffer(f"{name}_{i}") for name in ("first", "second"))
+        return self.get_buffer(f"move_{i}"), first, second
 
     def _move(self, learner: Host) -> None:
         """The parameters as the steps since the last rebuild want them."""
-        for i, (name, p) in enumerate(self._theta(learner).items()):
-            move = self.get_buffer(f"move_{i}")
-            p.add_(move)
-            move.zero_()
-            if name.split(".")[-1].startswith("log_"):  # far beyond what standardised data can mean
-                p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)
+        self._leads = False
+        if learner.engine is not None and learner.engine.arrive(learner):
+            return
+        self._add(self.theta(learner))
+        for i in range(len(self.theta(learner))):
+            self.get_buffer(f"move_{i}").zero_()
+
+    def _add(self, parameters: dict[str, Tensor]) -> None:
+        """The moves, in place."""
+        for i, (name, p) in enumerate(parameters.items()):
+            p.add_(self.get_buffer(f"move_{i}"))
+            if is_logarithm(name):
+                p.clamp_(LEAST_NOISE if name == "log_noise" else LEAST, MOST)
+
+
+def is_logarithm(name: str) -> bool:
+    """Whether a parameter of that name is one; a network's are not."""
+    return name.split(".")[-1].startswith("log_")
 
 
 def _shrink(n: Tensor) -> Tensor:
@@ -184,10 +235,8 @@ def _shrink(n: Tensor) -> Tensor:
     return (1.0 + n / 30.0).rsqrt().clamp_min(0.1)
 
 
-def _spread(value: Float[Tensor, "*batch"] | float, like: Tensor, shared: bool) -> Tensor | float:
+def _spread(value: Float[Tensor, "*batch"], like: Tensor, shared: bool) -> Tensor:
     """A value per model against a parameter; one shared by the fleet takes the mean."""
-    if not isinstance(value, Tensor):
-        return value
     if shared or like.shape[: value.dim()] != value.shape:
         return value.mean()
     return value[(..., *(None,) * (like.dim() - value.dim()))]

@@ -21,5 +21,10 @@ from __future__ import annotations
     DISTRUSTED,  # RobustWeight
     FACTOR,  # CalibrateNoise
     CHANGED, LEVELS, MISLED,  # DetectChanges
+    N_STEPS,  # LearnHyperparameters
+    LEARNING,  # samples of the window, of the memory in a step; parameters, entries of their gradient, and
+    # rows of these: addresses of a parameter, of what steps lead to, of the move there and Adam's moments;
+    # size, place in the gradient, 1 or (noise) 2: logarithm
+    RATES,  # of a step, square of a robust weight's threshold (0: none), factor of forgetting
     FIELDS,
-) = range(42)  # fmt: skip
+) = range(45)  # fmt: skip

@@ -20,7 +20,7 @@ from ...kernels.linear import LinearKernel
 from ...kernels.stationary import Matern32, SquaredExponential
 from .. import plan as P
 from ..forgetting import ForgettingFactor, ProcessNoise
-from ..hyperparameters import LearnHyperparameters
+from ..hyperparameters import LearnHyperparameters, is_logarithm
 from ..monitor import CalibrateNoise, DetectChanges, RobustWeight
 from ..part import Host, Part
 from ..units import Standardize
@@ -84,6 +84,11 @@ class Plan(Bound):
     def __init__(self, gp: Host) -> None:
         super().__init__()
         self.units, self.changes = gp.part(Standardize), gp.part(DetectChanges)
+        changing = [one for one in gp._parts if type(one).on_rebuild is not Part.on_rebuild]
+        last = changing[-1] if changing else None
+        #: of ProcessNoise, where nothing else changes the natural form after it
+        self.share = last.share if isinstance(last, ProcessNoise) else 0.0
+        self.begun: tuple[Any, ...] = ()  # see CompiledEngine.descend
         self.learning = gp.part(LearnHyperparameters)
         self.shape = tuple(gp.batch_shape)
         self.one, self.two = (*self.shape, gp.out_features), (*self.shape, gp.out_features, gp.in_features)
@@ -91,6 +96,7 @@ class Plan(Bound):
         fields = self._fields(gp)
         tensors = [value for value in fields.values() if isinstance(value, Tensor)]
         self.parameters = tuple(gp.kernel.hyperparameters().values())
+        tensors += [*gp.units.buffers(), *(self.learning.buffers() if self.learning is not None else ())]
         used = set(map(id, (*tensors, *self.parameters)))
         owners = (one for one in gp.modules() if not used.isdisjoint(map(id, one.buffers(recurse=False))))
         own = *owners, *(one for one in gp.kernel.modules() if one._parameters)
@@ -101,17 +107,22 @@ class Plan(Bound):
             return
         for field, value in fields.items():
             self.row[field] = value.data_ptr() if isinstance(value, Tensor) else value
-        widths = [gp.in_features]
+        widths, self.layers = [gp.in_features], []
         if isinstance(gp.kernel, DeepKernel):
             *hidden, last = gp.kernel.weights
-            layers = [p for pair in zip(hidden, gp.kernel.biases, strict=True) for p in pair] + [last, last]
+            self.layers = [p for pair in zip(hidden, gp.kernel.biases, strict=True) for p in pair] + [
+                last,
+                last,
+            ]
             widths += [weight.shape[-1] for weight in gp.kernel.weights]
             self.row[P.LAYERS], self.row[P.WIDTHS] = len(widths) - 1, self.own(np.array(widths))
-            self.row[P.WEIGHTS] = self.own(np.array([p.data_ptr() for p in layers]))
+            self.row[P.WEIGHTS] = self.own(np.array([p.data_ptr() for p in self.layers]))
         width = widths[0] + (widths[-1] if len(widths) > 1 else 0)
         self.row[P.WIDTH], self.row[P.VALUES] = width, sum(widths)
         self.row[P.EMBEDDED] = self.own(np.empty((len(self.all), gp.posterior.capacity + 1, width)))
         self._basis, self._marks = gp.posterior.basis, [-1]
+        if self.learning is not None:
+            self._of_learning(gp, self.learning)
 
     def _fields(self, gp: Host) -> dict[int, Any]:
         posterior, recent, x, y = gp.posterior, gp.recent, gp.units.input, gp.units.output
@@ -137,6 +148,35 @@ class Plan(Bound):
             level, misled = self.changes.level, self.changes.misled.level
             fields |= {P.CHANGED: level, P.LEVELS: self.changes.levels, P.MISLED: misled}
         return fields
+
+    def _of_learning(self, gp: Host, learning: LearnHyperparameters) -> None:
+        """:attr:`past`: the state of which the loss is, with the parameters that steps lead to."""
+        row, models, past = self.row.copy(), len(self.all), learning.loss.state
+        row[P.N_STEPS] = learning.n_steps.data_ptr()
+        row[[P.BASIS, P.ACTIVE, P.MOMENTS, P.VECTORS]] = [
+            t.data_ptr() for t in (past.basis, past.active, past.moments, past.vectors)
+        ]
+        row[P.EMBEDDED] = self.own(np.empty((models, row[P.SLOTS], row[P.WIDTH])))
+        d, own = gp.in_features, models if row[P.OWN] else 1
+        fields = P.LOG_LENGTHSCALE, P.LOG_ACTION, P.LOG_VARIANCE
+        places = dict(zip(row[list(fields)].tolist(), (0, d - int(row[P.ACTIONS]), d), strict=True))
+        layers, at = self.layers, d + 1
+        for p in layers[:-1]:  # the last layer has no bias, and stands twice
+            places[p.data_ptr()], at = at, at + p.numel() // own
+        places[gp.log_noise_variance.data_ptr()], rows, leads = at, [], {}
+        for i, (name, p) in enumerate(learning.theta(gp).items()):
+            address, size = p.data_ptr(), p.numel() // (models if name == "log_noise" else own)
+            leads[address] = self.own(np.empty(p.numel()))
+            kind = is_logarithm(name) + (name == "log_noise")
+            moments = (t.data_ptr() for t in learning.moments(i))
+            rows.append([address, leads[address], *moments, size, places[address], kind])
+        for field in (*fields, P.LOG_NOISE):
+            row[field] = leads.get(int(row[field]), 0)
+        row[P.WEIGHTS] = self.own(np.array([leads[p.data_ptr()] for p in layers], np.int64))
+        row[P.RATES] = self.own(np.array(learning.figures()))
+        counts = [learning.window, learning.replayed(gp), len(rows), at + gp.out_features]
+        row[P.LEARNING] = self.own(np.array([*counts, self.own(np.array(rows))]))
+        self.past = row
 
     def is_rough(self, gp: Host) -> bool:
         """Whether a part changes the state before the present sample is learned."""

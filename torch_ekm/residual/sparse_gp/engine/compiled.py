@@ -13,10 +13,12 @@ from ...._warnings import warn
 from ....exceptions import SpeedWarning
 from ....typing import Tensor
 from ...report import MomentsWithJacobians, UpdateReport
+from .. import plan as P
 from ..part import Host
 from .binding import Bound, Plan
 from .loading import load_loops
 
+_ALL = 3  # parts of a step
 _LEFT = "{} learns by torch, which takes several times as long as compiled loops: {}"
 
 
@@ -91,6 +93,78 @@ class CompiledEngine:
         novelty, nis, weight, variance = torch.from_numpy(figures.reshape(4, *plan.shape)).unbind()
         report = UpdateReport(torch.from_numpy(event.reshape(plan.shape)), novelty, nis, weight)
         return (report, torch.from_numpy(errors.reshape(plan.one)), variance), alarm
+
+    def wanders(self, gp: Host) -> bool:
+        """Whether :meth:`rebuild` does what ProcessNoise does before it."""
+        plan = self._free(gp)
+        return plan is not None and plan.share > 0.0
+
+    def rebuild(self, gp: Host) -> bool:
+        """The caches from the natural form; False: torch must do it."""
+        plan = self._free(gp)
+        if plan is not None:
+            loops: Any = load_loops()
+            loops.rebuild_fleet(plan.row, plan.share)
+        return plan is not None
+
+    def descend(self, gp: Host, n: int, since: tuple[int, int, bool], *, until: int = _ALL) -> bool:
+        """A step on the loss of LearnHyperparameters, after n samples; False: torch must do it.
+
+        Args:
+            since: samples up to the past state, changes of it so far, whether steps lead away from it.
+            until: of one model the work may come in parts: the past state's caches, what it predicts, the
+                gradient and the step. Those up to this one are done, if they are not yet.
+        """
+        plan, recent = self._free(gp), gp.recent
+        # the gradient of one kernel for all models is a sum
+        if plan is None or not (plan.row[P.OWN] or len(plan.all) == 1):
+            return False
+        if until < _ALL and len(plan.all) > 1:
+            return True
+        loops: Any = load_loops()
+        done, found = plan.begun[1:] if plan.begun[:1] == ((n, *since),) else (0, None)
+        n_rebuilt, _, leads = since
+        if done < 1:
+            loops.lead_fleet(plan.past)
+            if leads:
+                loops.embed_fleet(plan.past)
+                loops.rebuild_fleet(plan.past, 0.0)
+        if until > 1 and len(plan.all) > 1:
+            loops.descend_fleet(plan.past, n, n_rebuilt, recent.n_taken)
+        elif until > 1:
+            if found is None:
+                found = loops.predict_queries(plan.past, n, n_rebuilt, recent.n_taken)
+            if until == _ALL:
+                loops.finish_step(plan.past, n, n_rebuilt, found)
+        recent.n_taken += until == _ALL
+        plan.begun = () if until == _ALL else ((n, *since), 1, found)
+        return True
+
+    def arrive(self, gp: Host) -> bool:
+        """The parameters move to where steps lead; False: torch must do it."""
+        plan = self._free(gp)
+        if plan is None or not (plan.row[P.OWN] or len(plan.all) == 1):
+            return False
+        loops: Any = load_loops()
+        loops.lead_fleet(plan.past)
+        loops.arrive_fleet(plan.past)
+        loops.embed_fleet(plan.row)
+        return True
+
+    def pool(self, gp: Host, x: Tensor, y: Tensor, on: Tensor) -> bool:
+        """A block into the units, see ``Units.pool``; False: torch must do it."""
+        if self._free(gp) is None:
+            return False
+        loops: Any = load_loops()
+        for scale, block in ((gp.units.input, x), (gp.units.output, y)):
+            pooled = scale.shifted, scale.weight, scale.centre, scale.spread, scale.large
+            sizes = gp.batch_shape.numel(), *block.shape[-2:], float(scale.memory)
+            tensors = [t.contiguous() for t in (block, on)] + [*pooled]
+            loops.pool_columns(*sizes, *(t.data_ptr() for t in tensors))
+        return True
+
+    def _free(self, gp: Host) -> Plan | None:
+        return None if torch.compiler.is_compiling() else self.of(gp)
 
     # -- what they work on ----------------------------------------------------------------------
 

@@ -30,7 +30,7 @@ from .numba_math import (
     stack_at,
     vector_at,
 )
-from .numba_network import network, network_slopes
+from .numba_network import network, network_of_many, network_slopes
 
 
 @njit(types.void(I1, INT, A1, A1), **INNER)
@@ -53,16 +53,34 @@ def _embed(p, own, values, q):
             q[d + j] = values[values.shape[0] - features + j]
 
 
+@njit(types.void(I1, INT, A2, A2), **INNER)
+def embed_many(p, own, values, q):
+    """Points as :func:`_embed` has one, a row each."""
+    d, n_s, features, n = p[P.IN], p[P.IN] - p[P.ACTIONS], p[P.WIDTH] - p[P.IN], values.shape[1]
+    log_lengthscale, by = vector_at(p[P.LOG_LENGTHSCALE], own, n_s), np.ones(d)
+    for j in range(n_s):
+        by[j] = exp(-log_lengthscale[j])
+    if features > 0:
+        widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
+        network_of_many(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values)
+    for i in range(values.shape[0]):
+        for j in range(d):
+            q[i, j] = values[i, j] * by[j]
+        for j in range(features):
+            q[i, d + j] = values[i, n - features + j]
+
+
 @njit(types.void(I1), **COMMON)
 def embed_fleet(p):
     """The bases as the kernels see them, after torch has changed them or the kernels."""
-    d, M, W = p[P.IN], p[P.SLOTS], p[P.WIDTH]
-    values = np.empty(p[P.VALUES])
-    for i in range(p[P.MODELS] * M):
-        z = vector_at(p[P.BASIS], i, d)
-        for j in range(d):
-            values[j] = z[j]
-        _embed(p, i // M * p[P.OWN], values, vector_at(p[P.EMBEDDED], i, W))
+    d, M = p[P.IN], p[P.SLOTS]
+    values = np.empty((M, p[P.VALUES]))
+    for b in range(p[P.MODELS]):
+        basis = matrix_at(p[P.BASIS], b, M, d)
+        for i in range(M):
+            for j in range(d):
+                values[i, j] = basis[i, j]
+        embed_many(p, b * p[P.OWN], values, matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH]))
 
 
 @njit(F(I1, INT, A1, A1, A1, A1, A1, A1), **INNER)

@@ -52,21 +52,11 @@ def _correlations(kind, variance, active, k, psi):
 
 
 @njit(F(INT, INT, A1, A2, A1, F, A1, A1, A1, A1), **INNER)
-def kernel_row(kind, n_a, q, basis, active, log_variance, log_action, k, psi, phi):
-    """k between q and the basis, both as the kernel sees them; returns k(q, q).
-
-    ``psi`` and ``phi`` make the derivatives: ``dk/dq = psi (basis - q)`` of a state, ``phi Lambda basis`` of
-    an action.
-    """
+def of_distances(kind, n_a, q, basis, active, log_variance, log_action, k, psi, phi):
+    """See :func:`kernel_row`; k begins as squared distances."""
     n, n_s = basis.shape[0], q.shape[0] - n_a
     start = 0.0 if n_s > 0 else 1.0  # without a state it is a LinearKernel, which has a constant
     variance = math.exp(log_variance)
-    for i in range(n):
-        d2, point = 0.0, basis[i]
-        for j in range(n_s):
-            u = point[j] - q[j]
-            d2 += u * u
-        k[i] = d2
     _correlations(kind, variance, active, k, psi)
     if n_a == 0:
         return variance
@@ -82,6 +72,23 @@ def kernel_row(kind, n_a, q, basis, active, log_variance, log_action, k, psi, ph
         k[i] = phi[i] * inner if active[i] != 0.0 else 0.0
         psi[i] *= inner
     return variance * norm
+
+
+@njit(F(INT, INT, A1, A2, A1, F, A1, A1, A1, A1), **INNER)
+def kernel_row(kind, n_a, q, basis, active, log_variance, log_action, k, psi, phi):
+    """k between q and the basis, both as the kernel sees them; returns k(q, q).
+
+    ``psi`` and ``phi`` make the derivatives: ``dk/dq = psi (basis - q)`` of a state, ``phi Lambda basis`` of
+    an action.
+    """
+    n_s = q.shape[0] - n_a
+    for i in range(basis.shape[0]):
+        d2, point = 0.0, basis[i]
+        for j in range(n_s):
+            u = point[j] - q[j]
+            d2 += u * u
+        k[i] = d2
+    return of_distances(kind, n_a, q, basis, active, log_variance, log_action, k, psi, phi)
 
 
 @njit(types.void(A1, A2, A1, A1, A1, A2, A2), **INNER)

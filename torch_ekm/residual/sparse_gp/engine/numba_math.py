@@ -1,4 +1,4 @@
-"""What compiled loops are made of: types and options, memory at an address, exponential and logarithm.
+"""What compiled loops are made of: types and options, memory at an address, exp, log, products.
 
 The functions of this module vectorise where they stand in a loop, as those of the C library do not.
 """
@@ -134,3 +134,62 @@ def log(y):
     p = p * q + 0.2
     p = p * q + 1.0 / 3.0
     return e * 0.6931471805599453 + 2.0 * s * (p * q + 1.0)
+
+
+@njit(F(A1, A1, INT), **INNER)
+def dot(a, b, n):
+    """Of the first n entries."""
+    total = 0.0
+    for k in range(n):
+        total += a[k] * b[k]
+    return total
+
+
+@njit(types.void(A2, A2, F, A2, types.boolean, types.boolean), **INNER)
+def add_products(A, B, a, out, lower, upper):
+    """``out += a A B'``, four rows by two at a time: each number that is read serves two to four sums.
+
+    Args:
+        lower: only what lies on and below the diagonal (and a little above).
+        upper: A is an upper triangle.
+    """
+    n, m, K = A.shape[0], B.shape[0], A.shape[1]
+    for i in range(0, n - n % 4, 4):
+        end, k0 = min(m, i + 4) if lower else m, i if upper else 0
+        a0, a1, a2, a3 = A[i, k0:], A[i + 1, k0:], A[i + 2, k0:], A[i + 3, k0:]
+        for j in range(0, end - end % 2, 2):
+            b, c = B[j, k0:], B[j + 1, k0:]
+            s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
+            for k in range(K - k0):
+                s0 += a0[k] * b[k]
+                s1 += a1[k] * b[k]
+                s2 += a2[k] * b[k]
+                s3 += a3[k] * b[k]
+                t0 += a0[k] * c[k]
+                t1 += a1[k] * c[k]
+                t2 += a2[k] * c[k]
+                t3 += a3[k] * c[k]
+            out[i, j] += a * s0
+            out[i + 1, j] += a * s1
+            out[i + 2, j] += a * s2
+            out[i + 3, j] += a * s3
+            out[i, j + 1] += a * t0
+            out[i + 1, j + 1] += a * t1
+            out[i + 2, j + 1] += a * t2
+            out[i + 3, j + 1] += a * t3
+        for j in range(end - end % 2, end):
+            for r in range(i, i + 4):
+                out[r, j] += a * dot(A[r], B[j], K)
+    for i in range(n - n % 4, n):
+        for j in range(min(m, i + 1) if lower else m):
+            out[i, j] += a * dot(A[i], B[j], K)
+
+
+@njit(A2(A2), **INNER)
+def transposed(A):
+    """A', in memory of its own."""
+    out = np.empty((A.shape[1], A.shape[0]))
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[j, i] = A[i, j]
+    return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-from .numba_math import A1, A2, I1, INNER, INT, exp, matrix_at, vector_at
+from .numba_math import A1, A2, I1, INNER, INT, add_products, exp, matrix_at, transposed, vector_at
 
 
 @njit(types.void(I1, I1, INT, A1), **INNER)
@@ -64,3 +64,27 @@ def network_slopes(widths, weights, own, values, slopes):
             now = 1 - now
         for j in range(widths[0]):
             slopes[r, j] += both[now, j]
+
+
+@njit(types.void(I1, I1, INT, A2), **INNER)
+def network_of_many(widths, weights, own, values):
+    """:func:`network` of points, a row each."""
+    at, layers, n = 0, widths.shape[0] - 1, values.shape[0]
+    for layer in range(layers):
+        n_in, n_out, last = widths[layer], widths[layer + 1], layer == layers - 1
+        old, new = np.empty((n, n_in)), np.zeros((n, n_out))
+        bias = vector_at(weights[2 * layer + 1], own, 0 if last else n_out)
+        for i in range(n):
+            for j in range(n_in):
+                old[i, j] = values[i, at + j]
+            for j in range(bias.shape[0]):
+                new[i, j] = bias[j]
+        at += n_in
+        add_products(old, transposed(matrix_at(weights[2 * layer], own, n_in, n_out)), 1.0, new, False, False)
+        for i in range(n):
+            row, to = new[i], values[i, at : at + n_out]
+            if not last:
+                for j in range(n_out):
+                    row[j] = 1.0 - 2.0 / (exp(2.0 * row[j]) + 1.0)  # tanh
+            for j in range(n_out):
+                to[j] = row[j]
