@@ -37,8 +37,6 @@ lock: install
 
 demo: install
 	$(BIN)/torch-ekm demo --out demo_output
-	$(BIN)/python benchmarks/matrix.py new_object --objects box,can,bottle,weighted_box,applier \
-		--seeds 1000:1001 --out demo_output/new_object
 
 # files in their order: files of few tests, which may be the longest, would come last
 test: install
@@ -74,7 +72,7 @@ notebooks: install
 
 notebooks-smoke: install
 	$(BIN)/python tests/notebooks/smoke.py build/notebooks
-	TORCH_EKM_SMOKE=1 $(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 build/notebooks
+	$(BIN)/python -m pytest -o addopts="" -o timeout=600 --nbmake --nbmake-timeout=600 build/notebooks
 
 lint: install
 	$(BIN)/ruff check .

@@ -33,9 +33,9 @@ from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.kinematics.se3 import hat
 from torch_ekm.model import KinematicModel, Linearization
-from torch_ekm.model.stiffness.potential import posture_stiffness
+from torch_ekm.model.stiffness import posture_stiffness
 from torch_ekm.plant import Observation, Plant, PlantStatus
-from torch_ekm.plant.wrapper import PlantWrapper
+from torch_ekm.plant.plant import PlantWrapper
 from torch_ekm.simulation.mechanism.assembly import true_hand, true_object
 
 _DEG = math.pi / 180

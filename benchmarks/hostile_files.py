@@ -53,7 +53,7 @@ from torch_ekm.exceptions import EKMError
 from torch_ekm.experiments.learner_comparison.stream import load_table
 from torch_ekm.interop import read_bag
 from torch_ekm.plant import Observation, Trajectory, TrialLog, verify_log
-from torch_ekm.plant.trial_file import FORMAT
+from torch_ekm.plant.trajectory import FORMAT
 
 _ARRAY = "std_msgs/msg/Float64MultiArray"
 SLOWEST, LARGEST = 10.0, 1 << 30  # [s], bytes

@@ -26,6 +26,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -160,6 +161,8 @@ class Held:
     """In a new one, whose number it gives."""
     settle: Callable[[], None] = lambda: None
     """Waits until what was under way has ended."""
+    apart: Callable[[Callable[[], Any]], Any] = lambda work: work()
+    """Does what drives the hand, and gives what it returns."""
 
     def target(self, seen: Observation) -> PoseTarget:
         return PoseTarget.turned(seen.state, self.axis, degrees=self.degrees)
@@ -208,10 +211,13 @@ def behind(kind: str, python: str) -> Iterator[Held]:
             with bus.driver(path) as driver:
                 yield WithPose(driver, end, lost=end.lost)
 
-        def grip() -> Observation:
-            end.ask("reset 1000")
+        def grasped() -> Observation:
             with driven() as plant:
                 return plant.reset(1000)
+
+        def grip() -> Observation:
+            end.ask("reset 1000")
+            return in_child(grasped)
 
         def begun(drive: Callable[[Plant], None]) -> int:
             def child() -> None:
@@ -221,7 +227,7 @@ def behind(kind: str, python: str) -> Iterator[Held]:
             return forked(child)
 
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        yield Held(model, axis, 8.0, grip, driven, begun, end.resume)
+        yield Held(model, axis, 8.0, grip, driven, begun, end.resume, in_child)
 
 
 def forked(work: Callable[[], object]) -> int:
@@ -231,6 +237,29 @@ def forked(work: Callable[[], object]) -> int:
             work()
         os._exit(0)
     return child
+
+
+def in_child(work: Callable[[], Any]) -> Any:
+    """What it returns or raises in a process of its own: one that has driven a hand of ROS 2 has threads, and
+    a copy of it stands still."""
+    near, far = multiprocessing.Pipe()
+
+    def child() -> None:
+        try:
+            done = True, work()
+        except Exception as error:
+            done = False, error
+        far.send_bytes(pickle.dumps(done))
+
+    number = forked(child)
+    far.close()
+    try:
+        well, result = pickle.loads(near.recv_bytes())
+    finally:
+        os.waitpid(number, 0)
+    if not well:
+        raise result
+    return result
 
 
 def killed(held: Held, share: float, learns: bool, folder: Path, longest: float) -> tuple[int, str]:
@@ -244,6 +273,7 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
     journal = Journal(folder / "turn.ekm")
     child = held.begun(lambda plant: journal.run(held.loop(plant, seen, learns), held.target(seen)))
     while not journal.path.exists():
+        assert os.waitpid(child, os.WNOHANG) == (0, 0), "it ended before it began"
         time.sleep(0.002)
     time.sleep(share * longest)
     os.kill(child, signal.SIGKILL)
@@ -252,6 +282,11 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
     written = journal._read()
     if not journal.cut_short:
         return written["motions"], f"{written['reason']}, before it was killed"
+    return written["motions"], held.apart(lambda: resumed(held, journal, written, seen, learns))
+
+
+def resumed(held: Held, journal: Journal, written: dict, seen: Observation, learns: bool) -> str:
+    """How a turn that was killed ends."""
     with held.driven() as plant:
         recorded = Recorded(plant)
         loop = held.loop(recorded, seen, learns)
@@ -259,7 +294,7 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
         try:
             result = journal.resume(loop)
         except EKMError as error:
-            return written["motions"], type(error).__name__
+            return type(error).__name__
     kept = written["learned"]["knowledge.servo.weight"]
     assert not (written["motions"] and learns and torch.equal(kept, forgotten)), "nothing was kept"
     assert recorded.after, "it does not hold"
@@ -268,19 +303,24 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
         away = math.inf if begins is None else float((begins.a - recorded.after[0].a).abs().max())
         assert away < _STANDS, f"it goes on from elsewhere, {away:.3f} rad away"
     why = f": {result.stop.message}" if result.reason is StopReason.PLANT_FAILED else ""
-    return written["motions"], result.reason.value + why
+    return result.reason.value + why
+
+
+def whole(held: Held, seen: Observation) -> float:
+    """How long a turn back takes [s]; the way there loads more."""
+    with held.driven() as plant:
+        held.loop(plant, seen, True).run(held.target(seen))
+        there, began = plant.observe(), time.monotonic()
+        back = PoseTarget.turned(there.state, held.axis, degrees=-held.degrees)
+        held.loop(plant, there, True).run(back)
+        return time.monotonic() - began
 
 
 def kills(kind: str, n: int, seed: int = 0, python: str = sys.executable) -> Counter[str]:
     """What came of ``n`` turns of a hand that were killed at random moments."""
     draw, ends = np.random.default_rng(seed), Counter[str]()
     with here(kind) if kind in HERE else behind(kind, python) as held:
-        for _ in range(2):  # the first one loads more
-            seen = held.grip()
-            with held.driven() as plant:
-                began = time.monotonic()
-                held.loop(plant, seen, True).run(held.target(seen))
-                longest = time.monotonic() - began
+        longest = held.apart(partial(whole, held, held.grip()))
         for k in range(n):
             moment = draw.uniform(0.0, 1.0)
             with tempfile.TemporaryDirectory() as folder:

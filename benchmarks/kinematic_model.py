@@ -22,7 +22,7 @@ from torch_ekm.contact.contact_set import VARYING
 from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
-from torch_ekm.model.stiffness.geometric import geometric_stiffness
+from torch_ekm.model.stiffness import geometric_stiffness
 from torch_ekm.simulation import SimulatedHand
 
 BATCH = 1024

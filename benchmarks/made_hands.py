@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from mk3 import mk3
+
 
 def _link(name: str, length: float, more: str = "") -> str:
     body = '<inertial><origin xyz="0.02 0 0"/><mass value="0.01"/>'
@@ -183,9 +185,10 @@ def _jaw() -> tuple[str, str]:
 _MADE: dict[str, Callable[[], tuple[str, str]]] = {
     "tendon_springs": _tendon_springs, "four_bar": _four_bar, "not_round": _not_round, "servos": _servos,
     "stiff": _stiff, "metres": _metres, "jaw": _jaw, "idle": _idle, "coupled": _coupled, "round": _round,
+    "mk3": mk3,
 }  # fmt: skip
 KINDS = tuple(_MADE)[:9]
-"""Nine kinds of hands; "round" is none of them but a reference."""
+"""Nine kinds of hands; "round" is none of them but a reference, "mk3" a public hand."""
 
 
 def write_hand(kind: str, folder: Path) -> Path:

@@ -22,7 +22,7 @@ import pandas
 from contenders import Contender
 from hands import CONDITIONS, hands
 
-from torch_ekm._terminal import progress
+from torch_ekm._terminal import print_report, progress
 from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.protocols.protocol import Protocol
@@ -344,7 +344,8 @@ def ask(asked: Question, arguments: Sequence[str] | None = None, about: str | No
     with progress("running", len(planned.jobs)) as advance:
         trials = run_trials(planned, given.out, given.jobs, advance)
     made = write_report(planned, trials, given.out)
-    print(made.markdown(), verdict(asked.counted(trials), asked.by), sep="\n")
+    print_report(made, given.out, every=True)
+    print(verdict(asked.counted(trials), asked.by))
     return made
 
 

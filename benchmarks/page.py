@@ -28,6 +28,7 @@ class Section(NamedTuple):
 
     title: str
     see: str
+    """What was asked, and of what."""
     body: str
     """Markdown; a heading for each table, the first one apart if it is that of the whole."""
     how: str
@@ -39,7 +40,7 @@ class Section(NamedTuple):
 def page_text(
     title: str, sections: list[Section], written: list[str], name: str, files: dict[str, list[list[str]]]
 ) -> str:
-    """A page: results first, commands and versions last.
+    """A page: questions and results first, commands and versions last.
 
     Args:
         written: :func:`provenance`.
@@ -54,8 +55,8 @@ def page_text(
 
 
 def _laid_out(section: Section, name: str, files: dict[str, list[list[str]]]) -> list[str]:
-    """The answer, a picture and a short table, then what to see in them; other tables are files."""
-    shown, links, caption, tables, place, kept = [], [], section.title, 0, None, True
+    """What was asked, the answer, a picture and a short table; other tables are files."""
+    shown, links, caption, tables, kept = [section.see], [], section.title, 0, True
     for block in _blocks(section.body):
         if block.startswith("#"):
             caption = block.lstrip("# ") if block.startswith("##") else caption
@@ -73,12 +74,10 @@ def _laid_out(section: Section, name: str, files: dict[str, list[list[str]]]) ->
         elif picture := _PICTURE.fullmatch(block):  # and its caption
             if picture[2] == section.picture:
                 shown.append(f"![{picture[1]}]({name}/{picture[2]}.svg)\n\n*{picture[1]}*")
-                place = len(shown)
         elif block.startswith("```") and block.count("\n") > _MOST_LINES + 1:
             shown.append(f"<details>\n<summary>Printed output</summary>\n\n{block}\n\n</details>")
         elif not (block.startswith("*") and not block.startswith("**")) and (kept or not tables):
             shown.append(block)  # the note of a table goes with it
-    shown.insert(0 if place is None else place, section.see)
     return "\n\n".join([*shown, *([f"Tables: {', '.join(links)}."] if links else [])]).splitlines()
 
 

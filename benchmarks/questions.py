@@ -8,12 +8,13 @@ from typing import Any
 from contenders import BEGINNINGS, ORACLE, PARTS, PLAIN, PLANS, PRINTED, READINGS, WHOLE_TURNS, Contender
 from matrix import Frame, Question, bands_table, learning_picture, table
 from sensing import hall_table
-from sessions import TARGETS, directions, foresight, new_objects, there_and_back, turns
+from sessions import TARGETS, directions, foresight, there_and_back, turns
 
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.generalize import ENDS, TABLE_I, paper_table, significance_table
 from torch_ekm.experiments.reporting.report import Table
 from torch_ekm.experiments.reporting.tables import controller_table, prediction_table, reason_table
+from torch_ekm.experiments.runner import new_objects
 
 _ANGLES = (9.0, 19.0, 27.0)  # [deg] from fresh grasps
 _WARM_UP: dict[str, Any] = {"learns_by": 3}  # turns of the E-KM before those that count

@@ -100,19 +100,6 @@ def _readings(done: Manipulation) -> dict[str, float]:
     }
 
 
-def new_objects(make: Make, items: Sequence[str], seed: int, *, angles: Sequence[float]) -> list[TrialRecord]:
-    """Thirty motions with the first object; turns of the others, which the hand has never held."""
-    records, knowledge = [], None
-    for k, item in enumerate(items):
-        bench = make(item)
-        bench.knowledge = knowledge = bench.knowledge if knowledge is None else knowledge
-        records += (
-            [bench.trial(seed, j, angle) for j, angle in enumerate(angles)] if k else bench.learn_hand(seed)
-        )
-        bench.close()
-    return records
-
-
 def _warmed(make: Make, item: str, seed: int, angles: Sequence[float]) -> Bench:
     bench = make(item)
     for k, angle in enumerate(angles if bench.learns else ()):
@@ -262,10 +249,8 @@ def foresight(
 ) -> list[TrialRecord]:
     """Turns without the camera, by touch and by prediction; then as far as the grasp goes, predicted."""
     bench, made = _warmed(make, items[0], seed, learns_by), []
-    dark = {"learn": False, "blind_deg": math.inf}
-    ways = (
-        {"blind, by touch": {**dark, "touch": True}, "blind, prediction alone": dark} if bench.learns else {}
-    )
+    dark = {"blind, by touch": True, "blind, prediction alone": False}
+    ways = {part: {"learn": False, "touch": touch} for part, touch in dark.items() if bench.learns}
     for part, options in {**ways, "as far as it goes": {}}.items():
         start = bench.grasp(seed, _BLIND if options else _FAR)
         about = Trial(bench.name, "turn", bench.controller, seed, _FAR, blind if options else far)

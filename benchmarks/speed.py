@@ -31,7 +31,7 @@ from torch_ekm.experiments.reporting.plots import new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Column, Report, Table
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation
-from torch_ekm.plant.wrapper import PlantWrapper
+from torch_ekm.plant.plant import PlantWrapper
 from torch_ekm.simulation import SimulatedHand
 from torch_ekm.typing import Tensor
 

@@ -34,7 +34,7 @@ PLAN = tomllib.loads((HERE / "pages.toml").read_text(encoding="utf-8"))
 
 @dataclass(frozen=True)
 class Part:
-    """A command, and what a reader should see in what it prints."""
+    """A command, and the question that it answers."""
 
     title: str
     command: str

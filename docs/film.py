@@ -22,7 +22,7 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.inspection.view import view
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantWrapper
-from torch_ekm.rendering import Picture, Scene, Told, make_scene, save_animation
+from torch_ekm.rendering import Captions, Picture, Scene, make_scene, save_animation
 from torch_ekm.rendering.web import pad_forces
 from torch_ekm.simulation import SimulatedHand
 from torch_ekm.typing import Array
@@ -94,7 +94,7 @@ class Turn:
     def page(self, at: Array, hand: SimulatedHand) -> Path:
         """For the site."""
         left = self.between(self.errors, at)[:, 0]
-        told = Told(
+        captions = Captions(
             f"{hand.hand.name} turns {hand.object.name} by {ANGLE:g} deg: {self.name}",
             tuple(self.title(time) for time in at),
             left[0] - left,
@@ -102,7 +102,7 @@ class Turn:
             forces=pad_forces(hand.hand, self.between(self.q, at), self.between(self.forces, at)),
         )
         return save_animation(
-            self.scene(at, hand), DOCS / "_static" / "viewer" / "turn.html", told, seconds=SHOWN
+            self.scene(at, hand), DOCS / "_static" / "viewer" / "turn.html", captions, seconds=SHOWN
         )
 
     def title(self, time: float) -> str:
@@ -180,7 +180,7 @@ def main() -> None:
     turns[1].page(np.arange(0, turns[1].times[-1] + STEP / 2, STEP / 2), hand)
     hand.close()
     for name, what in (("hand", view("icub_right")), ("plan", view("icub_right", "box", reach=True))):
-        save_animation(what.scene, DOCS / "_static" / "viewer" / f"{name}.html", what.told)
+        save_animation(what.scene, DOCS / "_static" / "viewer" / f"{name}.html", what.captions)
     pictures = []
     for k, time in enumerate(at):
         page = Image.new("RGB", (2 * SIZE[0], TITLE + SIZE[1] + PLOT), "white")

@@ -1,7 +1,8 @@
-"""A task, a limit and a plant wrapper of your own: python examples/own_task_and_wrapper.py.
+"""A task, a limit, a planner and a plant wrapper of your own: python examples/own_task_and_wrapper.py.
 
 A task adds squares to the controller's program, a limit adds inequalities; both are rows in the motors'
-increments u [rad]. A wrapper changes what the loop sees of a plant, or what it commands.
+increments u [rad]. A planner decides on the movements. A wrapper changes what the loop sees of a plant, or
+what it commands.
 """
 
 import dataclasses
@@ -16,9 +17,11 @@ from torch_ekm.control import (
     Inequality,
     LinearizedModel,
     LookAndMoveController,
+    OneStep,
     PoseTarget,
     Situation,
     Squares,
+    WholeTurn,
 )
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.model import KinematicModel
@@ -50,6 +53,14 @@ class StaysAbove:
         return Inequality(-model.jacobian[row], room, unit=1e-3)
 
 
+class StepsWhereNear:
+    """Planner: whole turns where the target is more than 3 deg away, single steps where it is nearer."""
+
+    def plan(self, controller, seen, target, knowledge, firm):
+        far = controller.focus.error(target, seen.state) > 3 * DEGREE
+        return (WholeTurn() if far else OneStep()).plan(controller, seen, target, knowledge, firm)
+
+
 class WithoutForces(PlantWrapper):
     """Wrapper: a hand whose fingertips measure no force."""
 
@@ -64,6 +75,6 @@ tasks = (*DEFAULT_TASKS, KeepJoint(joint=0, weight=0.01))
 limits = (*DEFAULT_LIMITS, StaysAbove(seen.state.position[1].item() - 0.001))
 controller = LookAndMoveController(ekm, plant.rotation_axis, tasks, limits)
 target = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=8)
-result = ClosedLoop(plant, controller).run(target)
+result = ClosedLoop(plant, controller, planner=StepsWhereNear()).run(target)
 moved = torch.rad2deg(result.stop.final.q[0] - seen.q[0])
 print(f"{result.reason.value} after {len(result.steps)} motions, joint 0 moved by {moved:.1f} deg")

@@ -64,7 +64,7 @@ def read_file(path: str | os.PathLike, what: str, largest: int) -> bytes:
         DescriptionError: as there.
     """
     with opened(path, what, largest) as file:
-        content = file.read(largest + 1)  # it may have grown, or be one whose size nobody knows
+        content = file.read(largest + 1)  # it may have grown, or be of unknown size
     if len(content) > largest:
         raise DescriptionError(path, f"a {what} has at most {largest} bytes, this one is larger")
     return content

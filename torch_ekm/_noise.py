@@ -19,7 +19,7 @@ class Noise:
     joint: float = 0.5 * DEGREE
     """Of a joint with a sensor, or of a motion of it [rad]: Hall sensors after a calibration."""
     unsensed_joint: float = 10 * DEGREE
-    """Of a joint that only a cable tells of [rad]: pulleys are not as described, and cables stretch."""
+    """Of a joint that is measured at its cable alone [rad]: pulleys are not as described, cables stretch."""
     wrong_joint: float = 30 * DEGREE
     """Of a joint whose sensor is wrong [rad]: its range."""
     encoder: float = 0.0436
@@ -54,7 +54,7 @@ class Noise:
     force: float = 0.3
     """Of a measured normal force, or of a change of it that is predicted [N]."""
     pressing: float = 0.5
-    """A pad that measures less says nothing: it does not touch, or is dead [N]."""
+    """A pad that measures less does not touch, or is dead [N]."""
     any_normal_force: float = 10.0
     """Of a normal force of which nothing is known [N]: as much as a hand presses."""
     force_drift: float = 0.15
@@ -66,7 +66,7 @@ class Noise:
     outlier: float = 4.0
     """So many deviations off, an observation is none of what is estimated."""
     furthest: float = 5.0
-    """So many deviations of its prior off, no estimate is believed: its bounds."""
+    """Bounds of an estimate, in deviations of its prior."""
 
     @property
     def pose(self) -> tuple[float, ...]:

@@ -68,13 +68,25 @@ def say_error(text: object) -> None:
     Console(stderr=True).print(line, soft_wrap=True)
 
 
+def say_note(text: object) -> None:
+    """A remark, on the error stream."""
+    Console(stderr=True, markup=False).print(
+        f"Note:      {as_printed(text)}", soft_wrap=True, highlight=False
+    )
+
+
 @contextmanager
-def progress(what: str, total: int) -> Iterator[Callable[[object], None]]:
+def progress(what: str, total: int, seconds: float = 0.0) -> Iterator[Callable[[object], None]]:
     """What, a bar, how many of how many, for how long, how long still; gives what is called after each.
 
     Ctrl-C ends it; what is finished is kept by who runs it.
+
+    Args:
+        seconds: what all take on free cores: an estimate, until the first has ended; 0: unknown.
     """
-    say("Ctrl-C stops; the same command then goes on from there.")
+    minutes = max(round(seconds / 60), 1)
+    about = f"{total} to do, some {minutes} min on free cores, less what is finished. " if seconds else ""
+    say(f"{about}Ctrl-C stops; the same command then goes on from there.")
     name = TextColumn("{task.description}", markup=False)
     left = TextColumn("left:"), TimeRemainingColumn()
     columns = (name, BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), *left)
@@ -94,10 +106,10 @@ def unbroken(text: str, width: int) -> str:
     return textwrap.fill(kept, width, break_long_words=False, break_on_hyphens=False).replace("\u00a0", " ")
 
 
-def print_report(report: Report, folder: Path, notes: bool = False) -> None:
-    """What came of it, the first table, and where the page is, which has the others."""
+def print_report(report: Report, folder: Path, notes: bool = False, every: bool = False) -> None:
+    """What came of it, the leading tables or every one, and where the page is, which has all."""
     say(unbroken(as_printed(report.summary), console.width))
-    for table in report.tables[:1]:
+    for table in report.tables if every else report.tables[: max(report.leading, 1)]:
         print_table(table.header, table.text(), table.caption, table.note if notes else None)
     if report.figures:
         say(f"Figures:   {', '.join(figure.path for figure in report.figures)}")

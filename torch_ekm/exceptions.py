@@ -6,7 +6,7 @@ choices where there are any, and says in its message what would be right.
 
 That clause holds for what a loop calls with samples, readings, states and targets:
 learners and models (``update``, ``forward``, ``predict``, ``linearize``), a state's ``plus``
-and ``minus``, a target's ``error``, ``decide``, ``run``, ``steps``, ``plan``, ``reachability``,
+and ``minus``, a target's ``error``, ``decide``, ``run``, ``steps``, ``plan``,
 a plant's ``command`` and ``follow``, and ``update`` and ``learn`` of what is known of a hand. There
 a text or None in place of a tensor, a state or a target is a :class:`ParameterError`, too, and
 nothing was changed. Constructors, and functions that take what came through one of these doors,

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 from motors import Motors
 
-from torch_ekm.drivers.servos import SERVOS
+from torch_ekm.drivers.dynamixel_port import SERVOS
 
 _HEADER = b"\xff\xff\xfd\x00"
 _PING, _READ, _WRITE, _SYNC_READ, _SYNC_WRITE, _STATUS = 0x01, 0x02, 0x03, 0x82, 0x83, 0x55

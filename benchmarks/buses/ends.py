@@ -298,7 +298,7 @@ class End:
         if hand == "hand":
             plant = simulated()
             plant.reset(0)
-            self.motors = self.hand = HandMotors(plant, bus, value, 0.05 if kind == "yarp" else 0.0)
+            self.motors = self.hand = HandMotors(plant, bus, value)
         else:
             self.motors = Motors(bus([START] * len(SIGNS)), float(hand) * per)
         self.spoiler = Spoiler(0.0, seed=1000)

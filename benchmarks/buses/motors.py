@@ -20,6 +20,9 @@ class Motors:
         speed: of each, per second.
     """
 
+    together = False
+    """Off with the last axis of a goal, on a bus that takes one after the other."""
+
     def __init__(self, start: Sequence[float], speed: float) -> None:
         self.speed = speed
         self._lock = threading.Lock()
@@ -60,28 +63,27 @@ class Motors:
 class HandMotors:
     """The motors of a plant, such as a simulated hand, in the units of a bus.
 
-    A goal is carried out by a thread of its own, as one command; while it runs, ``moving`` is True and the
-    old positions are shown. A goal that comes meanwhile is carried out next.
+    Goals are carried out by a thread of its own, one after the other, each as one command; meanwhile
+    ``moving`` is True and the old positions are shown. A hand comes by all goals, however busy the machine.
 
     Args:
         plant: with a grasped object.
         bus: (a [rad]) -> positions of the motors.
         value: the inverse of it.
-        gather: a goal is carried out so much later [s]: a bus that takes one axis after the other has then
-            sent all.
     """
+
+    together = True
 
     def __init__(
         self,
         plant: Plant,
         bus: Callable[[Sequence[float]], list[float]],
         value: Callable[[Sequence[float]], list[float]],
-        gather: float = 0.0,
     ) -> None:
-        self.plant, self._bus, self._value, self._gather = plant, bus, value, gather
+        self.plant, self._bus, self._value = plant, bus, value
         self.seen: Observation = plant.observe()
         """The newest reading of the plant."""
-        self._next: list[float] | None = None
+        self._next: list[list[float]] = []
         self._lock = threading.Lock()
         self._worker: Any = None
         self.goal = self.now()
@@ -105,7 +107,8 @@ class HandMotors:
     def send(self, goal: Sequence[float]) -> None:
         """Off to other goals."""
         with self._lock:
-            self._next = self.goal = list(goal)
+            self.goal = list(goal)
+            self._next.append(self.goal)
             if self._worker is None:
                 self._worker = threading.Thread(target=self._work, daemon=True)
                 self._worker.start()
@@ -113,15 +116,14 @@ class HandMotors:
     def stop(self, at: float) -> None:
         """Carry out nothing more."""
         with self._lock:
-            self._next = None
+            self._next = []
 
     def _work(self) -> None:
         while True:
-            time.sleep(self._gather)
             with self._lock:
-                goal, self._next = self._next, None
-                if goal is None:
+                if not self._next:
                     self._worker = None
                     return
+                goal = self._next.pop(0)
             delta = torch.tensor(self._value(goal), dtype=torch.float64) - self.seen.a
             self.seen = self.plant.command(delta)

@@ -37,5 +37,8 @@ def answer(text: str, motors: Any, first: int = 0, modes: dict[int, str] | None 
             return "[fail]"
         goal = list(motors.goal)
         goal[int(moved[1]) - first] = float(moved[2])
-        motors.send(goal)
+        if motors.together and int(moved[1]) < axes - 1:
+            motors.goal = goal
+        else:
+            motors.send(goal)
     return "[ok]"

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from torch_ekm.description import HandDescription
-from torch_ekm.kinematics.play import Play
+from torch_ekm.kinematics.servo_model import Play
 from torch_ekm.model import KinematicModel
 from torch_ekm.model.calibration import Calibration, calibrate
 from torch_ekm.plant import Observation, PlantStatus, Trajectory

@@ -22,7 +22,7 @@ from experiments_records import frame
 from hands import CONDITIONS, FAMILIES, OTHERS, STRENGTHS, hands
 from matrix import FIGURES, bands_table, pivot, verdict
 from questions import QUESTIONS
-from sessions import TARGETS, Part, new_objects, target_of
+from sessions import TARGETS, Part, target_of
 
 from torch_ekm.control.safety.on_the_way import OnTheWay
 from torch_ekm.experiments import runner
@@ -185,7 +185,7 @@ def test_a_new_object_begins_with_the_hand_of_another(monkeypatch: pytest.Monkey
             return super().trial(*what, **options)
 
     setting = Setting(hand="planar_two_finger", engine="mujoco").hardware_instance(3)
-    made = new_objects(lambda item: Noted(setting, item, "E-KM"), ["box", "can"], 3, angles=(4.0,))
+    made = runner.new_objects(lambda item: Noted(setting, item, "E-KM"), ["box", "can"], 3, angles=(4.0,))
     assert (made[-1].object, made[-1].kind) == ("can", "turn")
     assert {(one.object, one.kind) for one in made[:-1]} == {("box", "first")}
     (_, none, _), *_, (item, known, learner) = grasps

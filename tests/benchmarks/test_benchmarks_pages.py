@@ -31,7 +31,7 @@ def test_every_command_is_there() -> None:
         for part in write_pages.parts_of(name):
             script = part.words(Path("out"), quick=True)[1]
             assert script.startswith("-") or Path(script).exists(), script
-            assert part.see.endswith(".")
+            assert part.see.endswith((".", "?"))
 
 
 def test_no_picture_of_a_page_is_written_over_by_another() -> None:
@@ -107,15 +107,15 @@ def test_a_report_comes_with_its_headings_below_the_pages(
     write_pages.main(["one", "--quick", "--out", str(tmp_path / "out")])
     text = (tmp_path / "out" / "one.md").read_text(encoding="utf-8")
     assert "# Title" not in text
-    assert "An answer.\n" in text
-    assert "\n![Seen.](one/shown.svg)\n\n*Seen.*\n\nLook.\n\n### A table\n\n| a | c |" in text
+    assert "Look.\n\nAn answer.\n" in text
+    assert "\n![Seen.](one/shown.svg)\n\n*Seen.*\n\n### A table\n\n| a | c |" in text
     assert "| - | 0.50 |\n| 1\\|2 |  |\n\nA note." in text
     assert "Left out" not in text
     assert (tmp_path / "out" / "one" / "shown.svg").exists()
     assert sys.executable not in text
 
 
-def test_results_come_first_and_long_tables_are_files() -> None:
+def test_a_question_comes_first_and_long_tables_are_files() -> None:
     def table(rows: int) -> str:
         return "\n".join(["| a |", "|---|", *(f"| {k} |" for k in range(rows))])
 
@@ -125,9 +125,9 @@ def test_results_come_first_and_long_tables_are_files() -> None:
     part = Section("Part", "See.", body, "`run`: commit 1.", "a")
     text = page_text("Page", [part], ["By it."], "one", files)
     shown = [
+        "See.",
         "Answer.",
         picture.replace("a.svg", "one/a.svg"),
-        "See.",
         f"### Short\n\n{table(8)}\n\nNote.",
         "Tables: [Other](one/other.csv).",
     ]

@@ -6,8 +6,7 @@ import dataclasses
 
 import torch
 
-from torch_ekm.contact.contact_kinematics import ContactKinematics, contact_kinematics
-from torch_ekm.contact.contact_model import ContactModel
+from torch_ekm.contact.contact_kinematics import ContactKinematics, ContactModel, contact_kinematics
 from torch_ekm.contact.contact_set import ContactSet
 
 F64 = torch.float64

@@ -6,9 +6,7 @@ import clarabel
 import numpy as np
 from scipy import sparse
 
-from torch_ekm.contact.forces.balance import BalanceEquations
-from torch_ekm.contact.forces.options import ForceOptions
-from torch_ekm.contact.forces.problem import force_cost, force_problem
+from torch_ekm.contact.forces.problem import BalanceEquations, ForceOptions, force_cost, force_problem
 
 
 def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> np.ndarray | None:

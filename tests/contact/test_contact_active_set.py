@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import qpsolvers
 
-from torch_ekm.contact.forces.active_set import EqualityProgram, solve_by_active_set
+from torch_ekm.contact.forces.solve import EqualityProgram, solve_by_active_set
 
 
 def drawn(seed: int, n: int = 10):

@@ -18,8 +18,7 @@ from torch_ekm.contact import (
     hand_jacobian,
 )
 from torch_ekm.contact.forces import problem, solve
-from torch_ekm.contact.forces.balance import BalanceEquations
-from torch_ekm.contact.forces.friction import friction_cones, margins
+from torch_ekm.contact.forces.problem import BalanceEquations, friction_cones, margins
 from torch_ekm.exceptions import ParameterError
 
 WEIGHT = np.array([0.0, 0.0, -9.81 * 0.25, 0.0, 0.0, 0.0])

@@ -7,6 +7,7 @@ import torch
 from contact_samples import F64, RADIUS, THREE, ball_contacts, held
 
 from torch_ekm.contact.contact_kinematics import (
+    ContactModel,
     constraint_matrix,
     contact_frames,
     full_grasp_matrix,
@@ -14,8 +15,8 @@ from torch_ekm.contact.contact_kinematics import (
     grasp_matrix,
     hand_jacobian,
     rolling_mobility,
+    selected_rows,
 )
-from torch_ekm.contact.contact_model import ContactModel, selected_rows
 from torch_ekm.contact.grasp_analysis import analyse
 from torch_ekm.kinematics.se3 import exp
 

@@ -77,3 +77,13 @@ def test_on_the_axis_of_a_cylinder_a_normal_is_given():
     np.testing.assert_allclose(distance, -0.02)
     np.testing.assert_array_equal(normal, [[1, 0, 0]] * 2)
     np.testing.assert_array_equal(signed_distance((long,), np.zeros(3))[1], [1, 0, 0])
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_a_grown_shape_is_nearer_by_as_much(kind):
+    """Along its axes, where no edge is nearest."""
+    shape, d = Shape(kind, SIZES[kind], np.eye(4)), 0.002
+    points = 0.08 * np.vstack([np.eye(3), -np.eye(3)])
+    apart = signed_distance((shape,), points)[0] - signed_distance((shape.grown(d),), points)[0]
+    np.testing.assert_allclose(apart, d, atol=1e-12)
+    assert shape.grown(-1.0).size > (0.0,) * len(shape.size)

@@ -12,7 +12,7 @@ from obedient_plant import Obedient
 
 from torch_ekm.control import Bands, ClosedLoop, HandFigures, HandKnowledge, LookAndMoveController, PoseTarget
 from torch_ekm.control.bands import lets_go, servo_std
-from torch_ekm.control.model_error import STEADY, ModelError
+from torch_ekm.control.knowledge import STEADY, ModelError
 from torch_ekm.enhanced import EnhancedModel
 
 DEG = math.pi / 180

@@ -170,14 +170,14 @@ LIES = {
     "motors reversed, encoders as told": (
         Hidden, None, Reason.WRONG_WAY, "joints and object made -", "torch-ekm check --plant"),
     "joints 3 deg too far": (
-        Obedient, changed(q=lambda k, q: q + 3 * DEG), Reason.UNSTABLE_GRASP, "joints read 3 deg too much",
+        Obedient, changed(q=lambda k, q: q + 3 * DEG), Reason.UNSTABLE_GRASP, "fingertips press (",
         "zero"),
     "joints 3 deg too little": (
-        Obedient, changed(q=lambda k, q: q - 3 * DEG), Reason.UNSTABLE_GRASP, "joints read -3 deg too much",
+        Obedient, changed(q=lambda k, q: q - 3 * DEG), Reason.UNSTABLE_GRASP, "fingertips press (",
         "zero"),
     "joints 3 deg too far from the middle on": (
         Obedient, changed(q=lambda k, q: q + 3 * DEG * (k > 2)), Reason.UNSTABLE_GRASP,
-        "joints read 3 deg too much", "zero"),
+        "fingertips press (", "zero"),
     "encoders drift": (
         Obedient, changed(a=lambda k, a: a + k * DEG), Reason.ENCODER_DRIFT, "sent nowhere", "magnet"),
 }  # fmt: skip
@@ -209,13 +209,15 @@ def error_of_a_clean_turn(held, ekm: EnhancedModel, knowledge: HandKnowledge) ->
     return float(torch.stack(off).square().mean().sqrt()) / DEG
 
 
-@pytest.mark.parametrize("lie", LIES)
-def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str) -> None:
+@pytest.mark.parametrize(
+    ("lie", "whole"), [*((lie, False) for lie in LIES), ("motors reversed, encoders too", True)]
+)
+def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str, whole: bool) -> None:
     kind, fault, reason, what, remedy = LIES[lie]
     ekm, knowledge, before = copy.deepcopy(taught)
     plant = kind(held[2], held[0], fault, since=0, dead_zone=1.3 * DEG)
     controller = LookAndMoveController(ekm, held[1])
-    loop = ClosedLoop(plant, controller, knowledge=knowledge, planner=OneStep())
+    loop = ClosedLoop(plant, controller, knowledge=knowledge, planner=None if whole else OneStep())
     known = knowledge.servo.estimate.clone()
     done = loop.run(PoseTarget.turned(held[0].state, held[1], degrees=20))
     assert done.reason is (reason or done.reason)
@@ -227,19 +229,6 @@ def test_a_sensor_that_lies_is_named_and_teaches_nothing(held, taught, lie: str)
     if lie.endswith("from the middle on"):
         assert torch.equal(knowledge.servo.estimate, known)
     assert error_of_a_clean_turn(held, ekm, knowledge) < 1.1 * before
-
-
-def test_an_encoder_of_a_motor_at_work_that_drifts_is_found_and_what_it_taught_is_taken_back(held) -> None:
-    """Its joints do not show what it shows; moment arms that are not as described look alike for a while."""
-    fault = changed(a=lambda k, a: a + k * DEG * third(a))
-    plant, knowledge = Obedient(held[2], held[0], fault, since=0), HandKnowledge.of(held[2].hand)
-    known = {name: value.clone() for name, value in knowledge.state_dict().items()}
-    _, done = turn(held, plant, 30.0, knowledge=knowledge)
-    assert done.reason is Reason.ENCODER_DRIFT
-    assert re.search("encoder 'thumb_distal' went 0[.][67][0-9]* deg more than its joints", done.stop.message)
-    assert len(done.steps) <= 12
-    left = {name: value for name, value in knowledge.state_dict().items() if name != "forces.reads"}
-    assert all(torch.equal(value, known[name]) for name, value in left.items())  # how pads read is no lesson
 
 
 @pytest.mark.parametrize("learns", [True, False])

@@ -243,7 +243,6 @@ FAULTS = {
     "saturated fingertips": (saturated([0, 1, 2]), {}, Reason.FINGERTIP_FAULT, "joints and springs"),
     "too much force": (
         lambda plant, seen: seen, {"force_ceiling": 3.0}, Reason.FORCE_CEILING, "force_ceiling is 3 N"),
-    "too fast": (lambda plant, seen: seen, {"speed": 0.01}, Reason.SPEED_CEILING, "driver must wait"),
     "too far": (
         lambda plant, seen: seen, {"increment": 0.1 * DEG}, Reason.COMMAND_REFUSED, "allowed are up to"),
 }  # fmt: skip

@@ -18,8 +18,7 @@ from torch_ekm.control import (
     LookAndMoveController,
     PoseTarget,
 )
-from torch_ekm.control.knowledge import previous
-from torch_ekm.control.model_error import ModelError
+from torch_ekm.control.knowledge import ModelError, previous
 from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
@@ -220,11 +219,11 @@ def test_what_is_believed_is_shown(driven, tmp_path) -> None:
     told = json.loads(other.output)
     assert "a hand with the actuators" in told["description"]
     assert told["motions"] == int(driven.knowledge.figures.count)
-    found = {(one["name"], one["figure"]): one for one in told["beliefs"]}
+    found = {(one["name"], one["figure"]): one for one in told["estimates"]}
     assert found["thumb_distal", "dead zone [deg]"]["value"] == pytest.approx(
         float(driven.knowledge.servo.dead_zone[3]) / DEG
     )
-    assert len(told["beliefs"]) == 2 * 9 + 5 + len(driven.knowledge.figures) + 2
+    assert len(told["estimates"]) == 2 * 9 + 5 + len(driven.knowledge.figures) + 2
     assert CliRunner().invoke(app, ["knowledge", str(path), "--reset", "servo"]).exit_code == 0
     assert not bool(HandKnowledge.load(path).servo.estimate.any())
     assert bool(HandKnowledge.load(previous(path)).servo.estimate.any())

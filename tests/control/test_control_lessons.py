@@ -20,6 +20,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control.lessons import Lessons
 from torch_ekm.enhanced import EnhancedModel
+from torch_ekm.model import KinematicModel
 
 DEG = math.pi / 180
 
@@ -147,5 +148,34 @@ def test_a_finger_that_slid_or_gave_its_load_away_says_nothing_of_forces(held, l
         seen, q=state.q, position=state.position, rotation=state.rotation, fingertip_force=force
     )
     lessons = Lessons(controller, loop.knowledge, loop.knowledge.figures)
-    lessons.learn(seen, decision, after, decision.delta_a, expected)
+    lessons.learn(seen, decision, after, decision.delta_a, expected, True)
     assert bool(loop.knowledge.forces.evidence.any()) is learns
+
+
+def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
+    """The box is 4.5 mm wider than it is described; each reading counts, and a manipulation begins anew."""
+    seen, axis, model = held
+    shapes = tuple(shape.scaled(0.85) for shape in model.obj.shapes)
+    thin = KinematicModel(model.hand, dataclasses.replace(model.obj, shapes=shapes))
+    for told, learns, surface in ((thin, True, 0.00225), (thin, False, 0.0), (model, True, 0.0)):
+        controller, known = (
+            LookAndMoveController(EnhancedModel.for_grasp(told, seen.state), axis),
+            HandKnowledge.of(model.hand),
+        )
+        controller.follow(known)
+        lessons = Lessons(controller, known, known.figures if learns else DescribedFigures())
+        lessons.touch(seen, lambda _: 0.0)  # joints that are off explain it better
+        assert controller.kinematic.surface == 0.0
+        lessons.touch(seen, lambda _: math.inf)
+        followed = controller.kinematic
+        assert followed.surface == pytest.approx(surface, abs=0.0005)
+        if surface:
+            gaps = followed.contacts(seen.state, seen.fingertip_force).gap
+            assert (
+                float(gaps.abs().max())
+                < 0.0005
+                < float(thin.contacts(seen.state, seen.fingertip_force).gap.min())
+            )
+        assert told.surface == 0.0
+        lessons.begin()
+        assert followed.surface == 0.0

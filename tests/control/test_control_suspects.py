@@ -49,7 +49,7 @@ def more(field: str, place: int, size: float) -> Fault:
 
 
 OFF = {  # 8 mm, 17 deg: less than what is called a jump
-    "pose": (more("position", 0, 0.008), "the object went along x", "fingertips press (thumb)"),
+    "pose": (more("position", 0, 0.008), "the object went along x", "fingertips press ("),
     "joint": (more("q", 6, -17 * DEG), "joint 'index_2' turned", "fingertips press (index)"),
 }  # fmt: skip
 

@@ -11,7 +11,6 @@ import torch
 from light_plant import Obedient
 
 from torch_ekm.control import ClosedLoop, HandKnowledge, LookAndMoveController, PoseTarget
-from torch_ekm.control.reach import reachability
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError
 from torch_ekm.plant import Path, ServoInverse
@@ -51,7 +50,6 @@ def doors(held) -> dict[str, Door]:
         "ekm.linearize": (ekm.linearize, [state, still]),
         "ekm.update": (ekm.update, [state, still, moved]),
         "decide": (controller.decide, [state, seen.a, target]),
-        "reachability": (lambda wrong: reachability(controller, seen, wrong), [target]),
         "loop.plan": (loop.plan, [target]),
         "plant.command": (inverse.command, [still]),
         "plant.follow": (lambda wrong: inverse.follow(wrong, lambda seen: True), [Path(still[None], [1.0])]),

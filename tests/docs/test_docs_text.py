@@ -53,6 +53,15 @@ def test_the_walks_through_the_code_name_what_is_there() -> None:
     assert not wrong
 
 
+def test_change_tasks_name_files_that_exist() -> None:
+    """Each change in CONTRIBUTING.md says where it is made, and names an example or a test of its kind."""
+    text = (DOCS.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    tasks = text.partition("## Change tasks")[2].partition("## Add a learner")[0]
+    named = [name for name in re.findall(r"`([\w/.]+)`", tasks) if "/" in name and "NAME" not in name]
+    assert len(named) > 20
+    assert not [name for name in named if not (DOCS.parent / name).exists() and ".venv" not in name]
+
+
 def test_the_glossary_is_short() -> None:
     """At most sixty terms, in their order."""
     page = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")

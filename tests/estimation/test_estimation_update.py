@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity
-from torch_ekm.estimation.parameter_filter import ParameterFilter
-from torch_ekm.estimation.update import surprise, update
+from torch_ekm.estimation.parameter_filter import ParameterFilter, surprise, update
 from torch_ekm.inspection.health import _Watch
 
 BATCH, N, M = 5, 4, 3

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import runpy
+import warnings
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from torch_ekm._terminal import as_printed, print_report, print_table, unbroken
+from torch_ekm._terminal import as_printed, print_report, print_table, progress, unbroken
 from torch_ekm.cli import app, main
 from torch_ekm.cli._help import GROUPS
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
@@ -42,6 +43,20 @@ def test_python_runs_the_package_as_the_command(monkeypatch, capsys) -> None:
         runpy.run_module("torch_ekm.cli", run_name="__main__")
     assert end.value.code == 0
     assert "yale_t42" in capsys.readouterr().out
+
+
+def test_a_warning_is_a_note_without_a_path(monkeypatch, capsys) -> None:
+    monkeypatch.setattr("sys.argv", ["torch-ekm", "--version"])
+    with pytest.raises(SystemExit):
+        main()
+    capsys.readouterr()
+    warnings.showwarning(UserWarning("loops are compiled"), UserWarning, "/a/path.py", 1)
+    assert capsys.readouterr().err == "Note:      loops are compiled\n"
+
+
+def test_how_long_it_takes_is_said_before_the_first_job_has_ended(capsys) -> None:
+    with progress("turning", 8, 130.0):
+        assert "8 to do, some 2 min on free cores" in capsys.readouterr().out
 
 
 def test_the_help_tells_how_much_there_is_to_run() -> None:

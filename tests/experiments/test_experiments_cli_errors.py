@@ -63,7 +63,7 @@ reproduce generalize --preset bad | unknown preset
 reproduce generalize --learner bad | unknown learner
 compare | Missing option '--data'
 compare --data none.csv | no such file
-compare --data folder | unknown recording
+compare --data folder | (--clock)
 compare --data folder.csv | no such file
 compare --data broken.urdf | are not read
 compare --data t42 | TORCH_EKM_DATA

@@ -43,7 +43,8 @@ BROKEN = {
     "decimal comma": ("a;b;y\n1,5;2;3\n" * 2, r"line 2, column 'a': '1,5' has a decimal comma"),
     "holes": ("a,b,y\n1,,3\n4,5,6\n7,8,nan\n", r"line 2, column 'b' is empty.* 2 of 3 lines have"),
     "one row": ("a,b,y\n1,2,3\n", r"it has 1 samples; at least 40"),
-    "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; the first line .* must name"),
+    "no header": ("1,2,3\n4,5,6\n", r"line 1 holds numbers only; .* comment right before it, must name"),
+    "a comment is no header": ("# of today\n1,2,3\n4,5,6\n", r"line 2 holds numbers only"),
     "ragged": ("a,b,y\n1,2,3\n1,2\n", r"line 3 has 2 fields, but the header names 3"),
     "empty": ("\n \n", r"the file is empty"),
     "twice": ("a,a,y\n" + GOOD, r"two columns are called 'a'"),
@@ -79,6 +80,9 @@ SAME = {  # whoever writes them, these are a, b c, y and ROWS
     "quotes in quotes": ('"a ""1""",b,y\n0.5,-1e-3,3\n2,1e20,-4\n', ['a "1"', "b", "y"]),
     "lines in names": ('"a\n[m]",b c,y\n0.5,-1e-3,3\n2,1e20,-4\n', ["a\n[m]", "b c", "y"]),
     "lines of Unicode": ("a\u2028b,b\x0bc,y\n0.5,-1e-3,3\n2,1e20,-4\n", ["a\u2028b", "b\x0bc", "y"]),
+    "blanks between": (" a  b   y \n 0.5  -1e-3   3\n  2.0   1e20  -4\n", ["a", "b", "y"]),
+    "numpy.savetxt": ("# run 1\n# a b y\n0.5 -1e-3 3\n2.0 1e20 -4\n", ["a", "b", "y"]),
+    "a header with #": ("# a, b c, y\n0.5,-1e-3,3\n2,1e20,-4\n", ["a", "b c", "y"]),
     "more commas than semicolons": ("a,1,2,3,4;b;y\n0.5;-1e-3;3\n2;1e20;-4\n", ["a,1,2,3,4", "b", "y"]),
 }
 
@@ -297,6 +301,11 @@ def test_how_many_of_how_many_rows_were_used_is_told(tmp_path: Path) -> None:
     assert "On the first 50 of 60 rows." in report.verdicts()[0]
     assert "default" in report.verdicts()[0]
     assert report.tables()[0].rows[0][0] in ("default", "default *")
+
+
+def test_a_folder_is_a_recording_of_ros_that_needs_a_clock(tmp_path: Path) -> None:
+    with pytest.raises(ParameterError, match="--clock"):
+        load_recording(tmp_path)
 
 
 def test_errors_of_each_output_are_given_in_the_units_of_the_file(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import pytest
+from made_up_sessions import made_up_turn
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
@@ -14,16 +15,17 @@ from torch_ekm.control import Safety, StoppingRule
 from torch_ekm.exceptions import UnknownNameError
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.jobs import read_result
-from torch_ekm.experiments.protocols.demo import Demo
+from torch_ekm.experiments.protocols.demo import Demo, new_table
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.report import Report
+from torch_ekm.experiments.reporting.trials import trial_frame
 from torch_ekm.experiments.reproduce import Experiment, reproduce
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import ModelOptions
 
 #: The dead zone stops a plain KM: it would go on for 30 motions until it is said to stall.
 BRIEF = Setting(engine="mujoco", safety=Safety(rule=StoppingRule(max_steps=16)))
-EXPERIMENT = Experiment(Demo(BRIEF, angles_deg=(9.0, 14.0)), (1,))
+EXPERIMENT = Experiment(Demo(BRIEF, angles_deg=(9.0, 14.0), new=()), (1,))
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +110,24 @@ def test_the_demo_is_a_preset_of_generalize_and_repeats_itself(records: list[Tri
     assert turn.errors_deg == ours.errors_deg
     assert list(turn.poses) == list(ours.poses)
     assert len(turn.poses) == turn.steps + 1
+
+
+def test_the_first_hand_turns_objects_that_it_has_never_held() -> None:
+    jobs = Demo(BRIEF, new=("box", "can")).jobs((3, 4))
+    new = {name: job for name, job in jobs.items() if name.startswith("new_")}
+    assert [*new.values()] == [(("box", "can"), name, 3) for name in ("KM", "E-KM")]
+    assert jobs.keys() - new == Demo(BRIEF, new=()).jobs((3, 4)).keys()
+    assert Demo(BRIEF).quick().jobs((3,)).keys().isdisjoint(new)
+
+
+def test_new_objects_are_told_apart_from_the_turns_that_are_tested() -> None:
+    made = [made_up_turn(name, 3, k, 9.0, "can") for name in ("KM", "E-KM") for k in range(2)]
+    new = [dataclasses.replace(one, kind="new") for one in made]
+    told = new_table(trial_frame({"a": new, "b": [made_up_turn("KM", 3, 5, 9.0, "box")]}))
+    assert [row[0] for row in told.rows] == ["can", "all"]
+    row = dict(zip(told.header, told.rows[0], strict=True))
+    assert row["E-KM: motions"] == pytest.approx(sum(one.steps for one in new[2:]) / 2)
+    assert row["KM: error [deg]"] == pytest.approx(sum(one.true_error_deg for one in new[:2]) / 2)
 
 
 def test_results_are_named_by_the_model_that_is_run() -> None:

@@ -41,6 +41,15 @@ def test_parallel_equals_serial_in_fresh_workers_that_take_closures(
     assert {watch for _, watch in parallel.values()} == {0.25}
 
 
+def test_loops_are_compiled_before_the_first_job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results would depend on when they are, by rounding."""
+    done: list[str] = []
+    monkeypatch.setattr(module, "warm_up", lambda: done.append("loops"))
+    for _ in range(2):  # the second time there is nothing to do
+        run_jobs(lambda: done.append("job"), {"a": ()}, tmp_path)
+    assert done == ["loops", "job"]
+
+
 def test_interrupted_run_resumes(tmp_path: Path) -> None:
     done: list[str] = []
     with pytest.raises(ValueError, match="negative") as told:

@@ -48,9 +48,9 @@ def test_what_a_learner_would_have_gained(tmp_path: Path) -> None:
     own = load_own(pendulum(tmp_path / "own.csv")[0], COLUMNS, servo)
     stream = own.stream()
     assert float(stream.y[:20].std(correction=0)) == pytest.approx(1.0)
-    report = compare(stream, ("model alone", "SOGP adaptive"))
+    report = compare(stream, ("model alone", "SOGP default"))
     assert report.scores["own", "model alone"].rms.mean == pytest.approx(1.0, abs=1e-5)
-    assert report.scores["own", "SOGP adaptive"].rms.mean < 0.4
+    assert report.scores["own", "SOGP default"].rms.mean < 0.4
 
 
 def test_increments_from_the_command_line(tmp_path: Path) -> None:

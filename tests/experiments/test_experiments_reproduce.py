@@ -72,7 +72,7 @@ def test_report_is_complete(name: str, reports: Callable[[str], tuple[Report, Pa
     assert configuration["versions"]["torch"]
     assert configuration["plant"]["dead_zone"] > 0
     assert "Development seeds" in report.summary
-    assert "no verdict" in report.summary
+    assert "not tested" in report.summary
 
 
 def test_a_hand_that_cannot_be_modelled_gives_the_reason_alone_and_ends_with_1(
@@ -84,7 +84,7 @@ def test_a_hand_that_cannot_be_modelled_gives_the_reason_alone_and_ends_with_1(
     shown = CliRunner().invoke(app, ["demo", "--seeds", "1:3", "--jobs", "1", "--out", str(out)])
     assert shown.exit_code == 1, shown.output
     said = " ".join(shown.output.split())
-    assert "Nothing was turned. 4 of 4 turns ended with 'unstable grasp': two hard fingers." in said
+    assert "Nothing was turned. 6 of 6 turns ended with 'unstable grasp': two hard fingers." in said
     assert "%" not in shown.output
     assert not list(out.glob("comparison.csv"))
 

@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from own_files import change, copied
 from typer.testing import CliRunner
@@ -197,6 +198,12 @@ def test_a_pinch_that_turns_little_is_told(most, state, monkeypatch):
     monkeypatch.setattr(ClosedLoop, "reach", lambda _, sign: SimpleNamespace(angle=turns[sign], end="end"))
     (row,) = module._turn(HAND, load_object("can"))
     assert (row.state, row.found) == (state, "predicted: -9 deg (end), +3 deg (end)")
+    few = "the motors come 8 % of the way: choose another"
+    monkeypatch.setattr(module, "out_of_reach", lambda *_: few)
+    (row,) = module._turn(HAND, load_object("can"))
+    told = "predicted: -9 deg (end), +3 deg (end)"
+    told += "; the motors come 8 % of the way" if state == "warning" else ""
+    assert (row.state, row.found) == (state, told)
 
 
 @pytest.mark.usefixtures("brief")
@@ -206,14 +213,20 @@ def test_springs_too_soft_for_the_usual_force_are_told_what_holds(monkeypatch):
 
     def found(soft, can, config, parameters) -> Cure:
         assert soft.spring_stiffness[0] == hand.spring_stiffness[0]
-        return Cure(["a pinch_force of 1.2 N", "an arm of 2"], soft.spring_rest)
+        problem = pinch_problem(soft, can, config, parameters)
+        failed = problem.geometry(np.zeros((1, len(problem.bounds()[0]))))
+        return Cure(["a pinch_force of 1.2 N", "an arm of 2"], failed)
 
+    drawn = []
     monkeypatch.setattr(module, "load_hand", lambda _: hand)
     monkeypatch.setattr(module, "smallest_changes", found)
-    rows = {row.name: row for row in check_hand("mine", "can")}
+    monkeypatch.setattr(module, "save_picture", lambda scene, path: drawn.append(scene) or path)
+    rows = {row.name: row for row in check_hand("mine", "can", Path("check.png"))}
     assert rows["limits"].state == "ok"
     assert "the fingertips reach it; torque is to blame: joint" in rows["pinch plan"].found
     assert rows["smallest change"].found == "the pinch holds with a pinch_force of 1.2 N; or an arm of 2"
+    seen = [shape.kind for shape, _ in drawn[-1].shapes[-drawn[-1].ghosts :]]
+    assert seen == ["cylinder"]  # the can, seen through
 
 
 def test_a_planned_pinch_that_is_lost_is_told_with_forces_and_distance(monkeypatch):

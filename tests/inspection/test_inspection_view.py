@@ -22,7 +22,7 @@ from torch_ekm.exceptions import (
 )
 from torch_ekm.inspection.view import view, view_hand, view_log
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
-from torch_ekm.rendering import Told, make_scene, save_animation
+from torch_ekm.rendering import Captions, make_scene, save_animation
 from torch_ekm.simulation import SimulatedHand
 
 pytest.importorskip("sapien")
@@ -102,8 +102,8 @@ def test_a_page_stands_alone_and_has_no_text_of_the_log(folder, tmp_path) -> Non
     recording.observations[0].info["events"] = (script,)
     seen = view_log(recording.save(tmp_path / "trial.h5"))
     assert script in seen.rows[0][-1]
-    seen = replace(seen, told=replace(seen.told, title=script, lines=(script,) * len(seen.rows)))
-    page = save_animation(seen.scene, tmp_path / "log.html", seen.told).read_text(encoding="utf-8")
+    seen = replace(seen, captions=replace(seen.captions, title=script, lines=(script,) * len(seen.rows)))
+    page = save_animation(seen.scene, tmp_path / "log.html", seen.captions).read_text(encoding="utf-8")
     assert "http" not in page
     assert "<iframe" not in page
     assert page.count("</script>") == 2
@@ -115,23 +115,23 @@ def test_a_page_stands_alone_and_has_no_text_of_the_log(folder, tmp_path) -> Non
 
 def test_a_page_tells_what_moves_how_far_and_with_what_force() -> None:
     seen = view("planar_two_finger", "box")
-    told, frames = seen.told, len(seen.scene.transforms)
-    assert told.title == "planar_two_finger holds box"
-    assert told.lines[:3] == ("at rest", "motor left +2.5 deg", "motor left +5.0 deg")
-    assert told.turned[2] == pytest.approx(float(seen.rows[1][1]), abs=0.06)
-    assert told.forces.shape == (frames, 2, 6)
-    sizes = np.linalg.norm(told.forces[0, :, 3:], axis=-1)
+    captions, frames = seen.captions, len(seen.scene.transforms)
+    assert captions.title == "planar_two_finger holds box"
+    assert captions.lines[:3] == ("at rest", "motor left +2.5 deg", "motor left +5.0 deg")
+    assert captions.turned[2] == pytest.approx(float(seen.rows[1][1]), abs=0.06)
+    assert captions.forces.shape == (frames, 2, 6)
+    sizes = np.linalg.norm(captions.forces[0, :, 3:], axis=-1)
     said = [float(part.split()[-1]) for part in seen.rows[0][3].split(", ")]
     np.testing.assert_allclose(sizes, said, atol=0.06)
     hand = load_hand("planar_two_finger")
     for k, pad in enumerate(hand.pads):  # where the pad is, and away from its link
-        place = told.forces[0, k, :3]
+        place = captions.forces[0, k, :3]
         assert 0 < np.linalg.norm(place) < 0.2, pad.name
     # both press towards the object between them
-    assert told.forces[0, 0, 3:] @ told.forces[0, 1, 3:] < 0
-    way = told.forces[0, 1, :3] - told.forces[0, 0, :3]
-    assert told.forces[0, 0, 3:] @ way > 0
-    reach = view("planar_two_finger", "can", reach=True).told
+    assert captions.forces[0, 0, 3:] @ captions.forces[0, 1, 3:] < 0
+    way = captions.forces[0, 1, :3] - captions.forces[0, 0, :3]
+    assert captions.forces[0, 0, 3:] @ way > 0
+    reach = view("planar_two_finger", "can", reach=True).captions
     assert len(reach.std) == len(reach.turned) == len(reach.lines)
     assert reach.std.max() > 0.1
     assert any("not safe" in line for line in reach.lines)
@@ -140,9 +140,9 @@ def test_a_page_tells_what_moves_how_far_and_with_what_force() -> None:
 def test_what_a_page_tells_is_of_its_frames(folder, tmp_path) -> None:
     scene = view_log(folder).scene
     with pytest.raises(ShapeError, match="lines"):
-        save_animation(scene, tmp_path / "page.html", Told(lines=("one",)))
+        save_animation(scene, tmp_path / "page.html", Captions(lines=("one",)))
     with pytest.raises(ShapeError, match="turned"):
-        save_animation(scene, tmp_path / "page.html", Told(turned=np.zeros(2)))
+        save_animation(scene, tmp_path / "page.html", Captions(turned=np.zeros(2)))
 
 
 def test_what_cannot_be_shown_is_named(folder, tmp_path) -> None:

@@ -12,7 +12,7 @@ import torch
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import ShapeError
 from torch_ekm.kinematics import ActuationMap
-from torch_ekm.kinematics.null_space import null_space
+from torch_ekm.kinematics.tensors import null_space
 
 HANDS = ("icub_right", "icub_left", "planar_two_finger")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torch_ekm.kinematics.null_space import null_space
+from torch_ekm.kinematics.tensors import null_space
 
 F64 = torch.float64
 

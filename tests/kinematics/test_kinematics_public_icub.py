@@ -6,11 +6,17 @@ Figures: robotology/icub-models @dca8c618, iCub_manual, iCubGazeboV2_5_visuomani
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+
+from made_hands import write_hand
+from mk3 import distal_angle
 
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.kinematics import ActuationMap, HandKinematics
@@ -108,3 +114,19 @@ def test_both_hands_have_the_public_coupling(tmp_path: Path) -> None:
         posture[hand.joint_names.index("index_0")] *= sign
         assert np.degrees(ActuationMap(hand).actuators(posture).numpy()) == pytest.approx(a, abs=1e-9)
         np.testing.assert_allclose(hand.coupling @ (posture.numpy() - hand.spring_rest), 0, atol=1e-12)
+
+
+def test_the_third_generation_closes_as_its_rods_say(tmp_path: Path) -> None:
+    """Closed, both joints of a finger are at the limits of the public URDF."""
+    hand = load_hand(write_hand("mk3", tmp_path))
+    assert (hand.n_q, hand.n_a) == (11, 7)
+    actuation, upper = ActuationMap(hand), torch.from_numpy(hand.actuator_upper)
+    closed = dict(zip(hand.joint_names, np.degrees(actuation.joints(upper).numpy()), strict=True))
+    middle = dict(zip(hand.joint_names, np.degrees(actuation.joints(upper / 2).numpy()), strict=True))
+    for finger, sums in (("thumb", (85, 55)), ("index", (95, 105.3)), ("medium", (95, 105.3))):
+        near, far = (closed[f"{finger}_{which}"] for which in ("proximal", "distal"))
+        assert (near, far) == pytest.approx(sums, abs=0.1)
+        near, far = (middle[f"{finger}_{which}"] for which in ("proximal", "distal"))
+        assert near + far == pytest.approx(sum(sums) / 2, abs=0.01)
+        rod = "thumb" if finger == "thumb" else "index"
+        assert far == pytest.approx(np.degrees(distal_angle(rod, np.radians(near))), abs=0.02)

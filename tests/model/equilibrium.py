@@ -12,14 +12,13 @@ from surface import TrackedContacts
 
 from torch_ekm.contact.contact_kinematics import ContactKinematics, constraint_matrix
 from torch_ekm.contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from torch_ekm.contact.forces.balance import ForceStatus
-from torch_ekm.contact.forces.friction import friction_cones, margins
+from torch_ekm.contact.forces.problem import ForceStatus, friction_cones, margins
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.model.force_balance import ForceBalance, pack_forces
 from torch_ekm.model.grasp_forces import GraspForces
 from torch_ekm.model.kinematic_model import KinematicModel
-from torch_ekm.model.stiffness.geometric import geometric_stiffness
+from torch_ekm.model.stiffness import geometric_stiffness
 from torch_ekm.typing import Float, Tensor
 
 

@@ -18,7 +18,7 @@ from torch_ekm.description import Actuator, HandDescription
 from torch_ekm.description.urdf import UrdfModel
 from torch_ekm.kinematics import GraspState, LinkPoses, se3
 from torch_ekm.model import KinematicModel
-from torch_ekm.model.stiffness.potential import gravity_gradient
+from torch_ekm.model.stiffness import gravity_gradient
 
 F64 = torch.float64
 

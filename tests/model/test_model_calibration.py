@@ -13,9 +13,8 @@ from torch_ekm.description import load_hand, write_transmission
 from torch_ekm.exceptions import DescriptionError, ParameterError, StateError, UnknownNameError
 from torch_ekm.kinematics import Play
 from torch_ekm.model import calibrate
-from torch_ekm.model.calibration.motions import rests
 from torch_ekm.model.calibration.parameters import PRIORS, Unknowns
-from torch_ekm.model.calibration.residuals import Evidence
+from torch_ekm.model.calibration.residuals import Evidence, rests
 
 F64 = torch.float64
 

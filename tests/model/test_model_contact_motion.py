@@ -112,6 +112,30 @@ def test_where_a_contact_slides_the_derivative_is_that_of_sliding(held, exact) -
     assert abs(float(at.margin_sensitivity[k] @ w)) < 1e-2 * float(at.normal_force_sensitivity[k].abs().max())
 
 
+def test_pads_that_press_off_the_surface_go_on_bearing(held) -> None:
+    """The object is 10 mm wider than described: its pads measure forces 5 mm off it."""
+    model, true, _, _ = held
+    thin = dataclasses.replace(model.obj, shapes=tuple(one.scaled(2 / 3) for one in model.obj.shapes))
+    model, pads = KinematicModel(model.hand, thin), [pad.name for pad in model.hand.pads]
+    force = torch.zeros(len(pads), dtype=F64)
+    for name, normal in zip(true.contacts.finger, true.forces.normal, strict=True):
+        force[pads.index(name)] = normal
+    contacts = model.touching(true.state, force)
+    assert contacts.gap.min() > contact_motion.NEAR
+    motion = ContactMotion(model, model.linearize(true.state, contacts, fingertip_force=force))
+    step = motion.move(torch.full((model.hand.n_a,), 0.05 * DEG, dtype=F64))
+    assert {step.modes[name] for name in true.contacts.finger} == {ContactMode.STICK}
+    for name in true.contacts.finger:
+        assert abs(step.normal[name] - force[pads.index(name)]) < 0.3
+
+
+def test_a_motion_far_from_everything_ends_the_grasp(held) -> None:
+    model, start, _, _ = held
+    away = dataclasses.replace(start.state, position=start.state.position + 0.1)
+    with pytest.raises(GraspError, match="slips away"):
+        ContactMotion(model, dataclasses.replace(start, state=away)).move(torch.zeros(9, dtype=F64))
+
+
 def test_a_finger_that_is_taken_away_opens_and_bears_nothing(held) -> None:
     model, start, a, _ = held
     motion, away = ContactMotion(model, start, a=a), torch.zeros(model.hand.n_a, dtype=F64)

@@ -12,7 +12,7 @@ from torch_ekm.contact import ContactSet, constraint_matrix
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
-from torch_ekm.model.stiffness.geometric import geometric_stiffness
+from torch_ekm.model.stiffness import geometric_stiffness
 
 PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "quasi_static_model.md"
 F64 = torch.float64

@@ -2,7 +2,7 @@
 
     python tests/notebooks/smoke.py FOLDER
 
-Cells have the sizes that teach; here stands what is put in their place. Notebook 5 asks TORCH_EKM_SMOKE.
+Cells have the sizes that teach; here stands what is put in their place.
 """
 
 from __future__ import annotations
@@ -26,6 +26,13 @@ SMALL = {
         "(name, limit=SAMPLES)": '(name, limit=680 if name == "t42" else SAMPLES)',
         "compare(mine, learners)": "compare(mine, learners, limit=60)",
         '    "river forest": RiverResidual,\n': "",
+    },
+    "05": {
+        "results = run_jobs(planned.protocol.run, jobs, Path(tempfile.mkdtemp()), 2)": (
+            "planned = plan(name, REPORTED_SEEDS[:1], quick=True)\n"
+            "        jobs = {job: one for job, one in planned.jobs.items() if {*controllers} & {*one}}\n"
+            "        results = run_jobs(planned.protocol.run, jobs, Path(tempfile.mkdtemp()))"
+        )
     },
     "06": {"range(400)": "range(60)"},
     "07": {

@@ -13,7 +13,6 @@ from torch_ekm.exceptions import DescriptionError
 from torch_ekm.experiments.reporting.notebook import (
     copy_notebooks,
     notebook_folder,
-    smoke_mode,
 )
 from torch_ekm.experiments.reporting.plots import new_figure
 from torch_ekm.experiments.reporting.report import Table
@@ -80,14 +79,6 @@ def test_copies(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(DescriptionError, match="name a folder"):
         copy_notebooks(tmp_path / "file")
-
-
-def test_smoke_mode_is_switched_on_by_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    for value, expected in (("1", True), ("0", False), ("", False)):
-        monkeypatch.setenv("TORCH_EKM_SMOKE", value)
-        assert smoke_mode() is expected
-    monkeypatch.delenv("TORCH_EKM_SMOKE")
-    assert smoke_mode() is False
 
 
 def test_tables_are_escaped() -> None:

@@ -177,6 +177,16 @@ def test_the_opposing_pad_is_found_by_directions_not_by_order():
     assert opposing_pads(turned, PlantConfig()) == ("pad 0", ("pad 1", "pad 2"))
 
 
+def test_an_index_without_a_middle_finger_has_the_others_beside_it():
+    """Two hard fingers hold nothing in space."""
+    hand = load_hand("icub_right")
+    thumb, index, middle, *_ = hand.pads
+    pads = thumb, index, dataclasses.replace(middle, name="medium")
+    found = opposing_pads(dataclasses.replace(hand, pads=pads), PlantConfig())
+    assert found == ("thumb", ("index", "medium"))
+    assert opposing_pads(hand, PlantConfig()) == ("thumb", ("index", "middle"))
+
+
 def test_a_pad_on_the_side_of_the_one_that_opposes_is_idle(tmp_path):
     hand = load_hand(write_hand("servos", tmp_path))
     pads = tuple(dataclasses.replace(pad, name=f"pad {pad.name}") for pad in hand.pads)

@@ -10,7 +10,7 @@ from fakes import FakePlant
 
 from torch_ekm.exceptions import DescriptionError, ParameterError, StateError
 from torch_ekm.plant import Observation, Plant, PlantStatus, RecordingPlant, ReplayedPlant, Trajectory, Truth
-from torch_ekm.plant.trial_file import read_trial, write_trial
+from torch_ekm.plant.trajectory import read_trial, write_trial
 from torch_ekm.simulation import Tug
 
 h5py = pytest.importorskip("h5py")

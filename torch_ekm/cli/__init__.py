@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+import warnings
 
-from .._terminal import say_error  # first: needs the extra
+from .._terminal import say_error, say_note  # first: needs the extra
 from ..exceptions import EKMError, MissingExtraError
 from . import describe as describe
 from . import experiments as experiments
@@ -21,7 +22,9 @@ _ClickException: type[Exception] = typer.BadParameter.__mro__[2]  # newer versio
 
 def main() -> None:
     """Entry point: what torch_ekm refuses on purpose, and what the system refuses (a full disk, say), is
-    reported in one line, without a traceback. The process ends with 1 then, with 2 if it was an option."""
+    reported in one line, without a traceback. The process ends with 1 then, with 2 if it was an option.
+    Warnings are notes of one line."""
+    warnings.showwarning = lambda message, *_: say_note(message)
     try:
         code = app(standalone_mode=False)
     except _ClickException as error:

@@ -120,11 +120,9 @@ def check(
     if any(row.state == "error" for row in rows):
         say_next("mend the first error; then the same command again")
         raise typer.Exit(1)
-    say_next(
-        f"torch-ekm show {hand} --object {object} --reach"
-        if plant is None
-        else f"torch-ekm identify-servo --plant {plant}"
-    )
+    dry = f"with the hand: torch-ekm check --plant {plant}{' --dry-run' if emulate else ''}"
+    real = dry if emulate or dry_run else f"torch-ekm identify-servo --plant {plant}"
+    say_next(f"torch-ekm show {hand} --object {object} --reach" if plant is None else real)
 
 
 @app.command()

@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from .._terminal import print_report, progress, say, say_next
+from .._terminal import console, print_report, progress, say, say_next
 from ..exceptions import ParameterError
 from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, parse_angles, parse_seeds
 
@@ -16,8 +16,8 @@ from typer import Argument, Option  # isort: skip
 if TYPE_CHECKING:
     from ..experiments.reproduce import Experiment
 
-#: Seconds of a session on one free core, else 20: how long it takes is said before the first has ended.
-_SESSION = {"online": 70}
+#: Seconds on one free core: of a session, else 20; of a quick one; of a learner with a row.
+_SESSION, _QUICK, _LEARNER = {"online": 70}, 8, 0.006
 
 
 @app.command()
@@ -29,10 +29,11 @@ def demo(
     jobs: Jobs = 2,
     quick: Annotated[bool, Option(help="Two seeds, two angles: a trial run.")] = False,
 ) -> None:
-    """Turn an object with the KM and with the E-KM, and report.
+    """Turn an object with the KM and with the E-KM, then objects that are new to the hand, and report.
 
-    Eight instances of the simulated hand, five turns from new grasps with each controller: two to three
-    minutes on two cores; half a minute with --quick. Interrupted, it continues where it stopped.
+    Eight instances of the simulated hand, five turns from new grasps with each controller; then four more
+    objects with the first of them: two to three minutes on two cores; half a minute with --quick.
+    Interrupted, it continues where it stopped.
     """
     from ..experiments.config import Setting
     from ..experiments.protocols.demo import Demo
@@ -128,6 +129,7 @@ def compare(
     santafe (steven2358/kafbox).
     """
     from ..experiments import compare as run
+    from ..experiments.learner_comparison.recordings import load_recording
     from ..experiments.learners import COMPARED
 
     chosen = names(learners) if learners else COMPARED
@@ -136,21 +138,13 @@ def compare(
     if jobs > 1 and find_spec("joblib") is None:
         say("One process at a time: joblib, of the extra 'experiments', is not installed.")
         jobs = 1
-    with progress("comparing", len(data) * len(chosen)) as advance:
-        compared = run(
-            data,
-            chosen,
-            targets=names(targets),
-            inputs=names(inputs),
-            predicted=names(predicted),
-            observation=names(observation),
-            run=run_column,
-            clock=clock,
-            limit=limit or None,
-            folder=out / "runs",
-            processes=jobs,
-            on_done=advance,
-        )
+    columns = {"targets": names(targets), "inputs": names(inputs), "predicted": names(predicted)}
+    columns |= {"run": run_column, "clock": clock}
+    with console.status("reading"):  # simulated_hand is made, which takes a minute
+        streams = [load_recording(one, limit or None, names(observation), **columns) for one in data]
+    seconds = _LEARNER * sum(map(len, streams)) * len(chosen) / jobs
+    with progress("comparing", len(data) * len(chosen), seconds) as advance:
+        compared = run(streams, chosen, folder=out / "runs", processes=jobs, on_done=advance)
     print_report(compared.write(out), out, notes=True)
     best = dict.fromkeys(compared.best(stream.name).learner for stream in compared.streams)
     say(f"Best:      {', '.join(best)}")
@@ -159,9 +153,9 @@ def compare(
 
 def _left_out(planned: Experiment) -> str:
     """What of the whole experiment is not run."""
-    objects = getattr(planned.protocol, "objects", ())
-    every = getattr(type(planned.protocol)(), "objects", ())
-    missing = [name for name in every if name not in objects]
+    whole, which = type(planned.protocol)(), "new" if hasattr(planned.protocol, "new") else "objects"
+    taken = getattr(planned.protocol, which, ())
+    missing = [name for name in getattr(whole, which, ()) if name not in taken]
     seeds = ", ".join(map(str, planned.seeds))
     return f"Seeds {seeds}; left out: {', '.join([*missing, 'other seeds', 'larger turns'])}."
 
@@ -171,9 +165,8 @@ def _run(what: str, planned: Experiment, folder: Path, jobs: int) -> None:
 
     if planned.quick:
         say(f"A trial run, which claims nothing. {_left_out(planned)}")
-    n, minutes = len(planned.jobs), len(planned.jobs) * _SESSION.get(what, 20) / jobs / 60
-    say(f"{n} sessions, {jobs} at once: some {max(1, round(minutes))} min, less what is finished.")
-    with progress(what, len(planned.jobs)) as advance:
+    n, each = len(planned.jobs), _QUICK if planned.quick else _SESSION.get(what, 20)
+    with progress(what, n, n * each / jobs) as advance:
         report = run(planned, folder, jobs, advance)
     print_report(report, folder)
     if report.empty:

@@ -15,6 +15,8 @@ from typer import Argument, Option  # isort: skip
 if TYPE_CHECKING:
     from ..inspection.view import View
 
+_TURN = 10  # seconds on a free core
+
 
 @app.command()
 def record(
@@ -41,7 +43,8 @@ def record(
     setting = Setting(hand=hand, preset=preset, engine=engine, sensing=sensing)
     config = RecordConfig(setting, object, controller, parse_angles(angles))
     chosen = parse_seeds(seeds)
-    with progress("recording", len(chosen) * len(config.angles_deg)) as advance:
+    n = len(chosen) * len(config.angles_deg)
+    with progress("recording", n, n * _TURN) as advance:
         made = run(config, chosen, log, on_trial=advance)
     ends = Counter(e.status if e.status == "not grasped" else e.reason or e.status for e in made.index)
     say(f"{made.folder.resolve()}: {', '.join(f'{n} {end}' for end, n in ends.items())}")
@@ -114,8 +117,8 @@ def _show(shown: View, page: Path) -> None:
     from ..rendering import save_animation
 
     if shown.rows:
-        print_table(shown.header, shown.rows, shown.told.title)
+        print_table(shown.header, shown.rows, shown.captions.title)
     for note in shown.notes:
         say(f"Not drawn: {note}")
-    say(f"Page:      {save_animation(shown.scene, page, shown.told).resolve()}")
+    say(f"Page:      {save_animation(shown.scene, page, shown.captions).resolve()}")
     say_next("open the page in a browser: play, step, drag to look around")

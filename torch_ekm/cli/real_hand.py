@@ -138,6 +138,7 @@ def health(
         raise typer.Exit(1)
     few = "" if sum(motions) > BASELINE else f" An actuator is judged after {BASELINE} motions."
     say(f"No actuator changed in {sum(motions)} motions.{few}")
+    say_next("torch-ekm knowledge FILE shows what a closed loop has learned of the hand")
 
 
 @app.command()
@@ -147,31 +148,31 @@ def knowledge(
     reset: Annotated[list[str], Option(help="servo, forces, figures or error: forget it; repeatable.")] = [],  # noqa: B006
     json: Annotated[bool, Option("--json", help="All figures, as JSON.")] = False,
 ) -> None:
-    """Show what is believed of a hand, since when, and where that differs from its description.
+    """Show the estimates of a hand, and which of them differ from its description.
 
     Differences are those of more than two standard errors. With --reset parts are forgotten; the file as it
     was is kept beside, with the ending .previous.
     """
     from ..control import HandKnowledge
-    from ..inspection.knowledge import Belief, about, beliefs
+    from ..inspection.knowledge import Estimated, about, estimates
 
     learned = HandKnowledge.load(file)
     for part in reset:
         learned.reset(part)  # pyright: ignore[reportArgumentType]
     if reset:
         learned.save(file)
-    told, found = about(learned, file, hand), beliefs(learned)
+    head, found = about(learned, file, hand), estimates(learned)
     if json:
-        say(dumps({**told, "beliefs": [one._asdict() for one in found]}, indent=1))
+        say(dumps({**head, "estimates": [one._asdict() for one in found]}, indent=1))
         return
-    for name, value in told.items():
+    for name, value in head.items():
         say(f"{name + ':':13}{value}")
     rows = [
         (one.part, one.name, one.figure, *map(_short, (one.value, one.std, one.described)), one.note)
         for one in found
         if one.deviates
     ]
-    print_table([*Belief._fields[:3], "believed", "+-", "described", ""], rows, str(file))
+    print_table([*Estimated._fields[:3], "estimated", "+-", "described", ""], rows, str(file))
     say(f"{len(found) - len(rows)} figures are as described, or not identified (--json lists them).")
     say_next(f"torch-ekm knowledge {file} --reset servo forgets a part, after a repair say")
 

@@ -11,8 +11,7 @@ from .contact_kinematics import (
 )
 from .contact_set import ContactSet
 from .detector import ContactDetector
-from .forces.balance import ForceStatus
-from .forces.options import ForceOptions
+from .forces.problem import ForceOptions, ForceStatus
 from .forces.solve import contact_forces
 from .grasp_analysis import analyse
 from .signed_distance import signed_distance

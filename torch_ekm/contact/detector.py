@@ -6,6 +6,7 @@ because the witness points of a distance query jump along a line of contact.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Collection
 from typing import Any
@@ -18,11 +19,10 @@ from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import DescriptionError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
-from ..kinematics.link_poses import Kinematics
+from ..kinematics.hand_kinematics import Kinematics
 from ..typing import Array, Float, Tensor
 from .contact_set import LINK_MARGIN, ContactSet, NearMiss
-from .link_contact import LinkShapes
-from .pad_contact import Pad, PadContact, Solid, pad_contact
+from .pad_contact import LinkShapes, Pad, PadContact, Solid, pad_contact
 
 CROWN_RADIUS = 0.5
 """R, of a pad along its axis [m]."""
@@ -127,6 +127,12 @@ class ContactDetector:
         found, _ = self._of_pads(frames, solids, margin, pressing, measured=False)
         links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
         return self._contact_set(found, [], position.dtype, position.device, links)
+
+    def grown(self, distance: float) -> ContactDetector:
+        """The same of an object whose surface is farther out by ``distance`` [m]."""
+        made = copy.copy(self)
+        made._shapes = [Solid(self._coal, shape.grown(distance)) for shape in self.obj.shapes]
+        return made
 
     def _placed(
         self, q: LinkPoses | Tensor, position: Tensor, rotation: Tensor

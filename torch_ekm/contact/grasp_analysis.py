@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 
 from ..typing import Float, Tensor
-from .contact_kinematics import ContactKinematics, constraint_matrix
-from .contact_model import ContactModel
+from .contact_kinematics import ContactKinematics, ContactModel, constraint_matrix
 from .contact_set import CHARACTERISTIC_LENGTH
 
 _TOLERANCE = 1e-8  # of the rank decisions

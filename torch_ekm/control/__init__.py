@@ -7,18 +7,25 @@ from ..estimation.hand_figures import DescribedFigures, HandFigures
 from .bands import Bands
 from .closed_loop import ClosedLoop
 from .controller import LookAndMoveController
-from .decision import Band, Decision, Piece, StopReason
+from .decision import Band, Decision, Piece, StopReason, Waypoint
 from .ends import Safety, StoppingRule
 from .focus import Direction, FocusedPose, PoseTarget
 from .journal import Journal
 from .knowledge import HandKnowledge
-from .limiting import LimitingFunction, StepBound
-from .limits import DEFAULT_LIMITS, ActuatorLimit, JointLimit, Limit, NormalForceLimit
+from .limits import (
+    DEFAULT_LIMITS,
+    ActuatorLimit,
+    JointLimit,
+    Limit,
+    LimitingFunction,
+    NormalForceLimit,
+    StepBound,
+)
 from .manipulation import Manipulation, Step, Stop
 from .model_hand import ModelHand
-from .plan import OneStep, Plan, Planner, Waypoint, WholeTurn
+from .plan import OneStep, Plan, Planner, WholeTurn
 from .qp import Bounds, Equality, Inequality, Squares
-from .reach import Reach, Reachability
+from .reach import Reach
 from .rehearsal import End, PathEnd
 from .safety import Guards
 from .situation import LinearizedModel, Situation
@@ -63,7 +70,6 @@ __all__ = [
     "Planner",
     "PoseTarget",
     "Reach",
-    "Reachability",
     "Safety",
     "Situation",
     "Squares",

@@ -13,7 +13,7 @@ from ..estimation.hand_figures import HandFigures
 from ..kinematics import GraspState
 from ..typing import Array, Float, Tensor
 from .decision import Band, Piece
-from .model_error import STEADY
+from .knowledge import STEADY
 
 if TYPE_CHECKING:
     from ..description import HandDescription

@@ -17,7 +17,6 @@ from .._extras import require
 from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import NoStateError, StateError
 from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
-from ..plant.frames_at_rest import mean_reading
 from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
 from .controller import LookAndMoveController
@@ -28,14 +27,13 @@ from .knowledge import HandKnowledge
 from .lessons import Lessons
 from .manipulation import Manipulation, Step, Stop
 from .plan import OneStep, Plan, Planner, WholeTurn
-from .reach import Reach, Reachability, reach, reachability
+from .reach import Reach, reach
 from .safety.guards import Objection, gravest
 from .safety.on_the_way import OnTheWay
 from .safety.watch import Watch
 
-_GRIPS, _AGAIN = 2, 4  # movements that only grip, before the first turn and in all, one after each turn
-_FULL, _LEAST = 0.75, 0.6  # of the wanted grip, below which is gripped: before the first turn, and later
-_ANY = 1e-6  # with a grip of any size, if no finger is weak
+# of the wanted grip, with which is turned after so many movements that only grip; then no finger is weak
+_FIRM = 0.75, 0.75, 1e-6, 1e-6
 
 
 class ClosedLoop:
@@ -64,7 +62,7 @@ class ClosedLoop:
         planner: decides on the movements; None: :class:`WholeTurn` of an enhanced model, else
             :class:`OneStep`.
         learn: False leaves the learner as it is.
-        decline: a target out of :meth:`reachability` ends as out of reach before anything moves.
+        decline: a target that the motors do not reach, to first order, ends before anything moves.
 
     Raises:
         ParameterError: no controller.
@@ -88,8 +86,7 @@ class ClosedLoop:
             if isinstance(followed := controller.kinematic.figures, HandFigures | DescribedFigures):
                 knowledge.figures = followed
         knowledge.check(hand)
-        controller.follow(knowledge.figures)
-        controller.forces = None if controller.enhanced is None else knowledge.forces
+        controller.follow(knowledge)
         self._figures = DescribedFigures() if controller.enhanced is None else knowledge.figures
         self.controller, self.learn, self.decline = controller, learn, decline
         self.planner = planner or (OneStep() if controller.enhanced is None else WholeTurn())
@@ -136,10 +133,8 @@ class ClosedLoop:
         Nothing moves, and nothing is learned.
         """
         check_kind("target", target, PoseTarget)
-        return self._planned(self.plant.observe(), target)
-
-    def _planned(self, seen: Observation, target: PoseTarget) -> Plan:
-        planner = self.planner if isinstance(self.planner, WholeTurn) else WholeTurn()
+        planner, seen = self.planner, self.plant.observe()
+        planner = planner if isinstance(planner, WholeTurn) else WholeTurn()
         return planner.plan(self.controller, seen, target, self.knowledge, 0.0, whole=True)
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
@@ -158,15 +153,6 @@ class ClosedLoop:
             GraspError: the model refuses the grasp as it is.
         """
         return reach(self.controller, self.knowledge, self.plant.observe(), sign, limit)
-
-    def reachability(self, target: PoseTarget) -> Reachability:
-        """Whether the motors can bring the object to ``target``: rank and conditioning of the focused rows of
-        J_m, and the ranges of the motors. To first order: without slip and links that touch.
-
-        Raises:
-            GraspError: the model refuses the grasp as it is.
-        """
-        return reachability(self.controller, self.plant.observe(), target)
 
     def run(self, target: PoseTarget) -> Manipulation:
         """Drive the object to ``target``.
@@ -196,24 +182,20 @@ class ClosedLoop:
                 if self.learn and controller.enhanced is not None and watch.fingertips.times is not None:
                     self.knowledge.forces.grasped(watch.fingertips.times)  # also of pads that seem to lie
                 return stop.told(watch.lie or watch.doubt)
-            except (Exception, KeyboardInterrupt) as error:
+            except BaseException as error:  # a closed generator as well: the hand must not go on
                 last, failure = self._gate.last, self._gate.failure
                 self.hold()
                 if last is None or not (error is failure or isinstance(error, KeyboardInterrupt)):
                     raise
                 return failed(error, last)
-            except BaseException:  # a closed generator as well: the hand must not go on
-                self.hold()
-                raise
 
     def _movements(self, target: PoseTarget, watch: Watch) -> Generator[Step, None, Stop]:
         """Look, plan, move, learn."""
-        first = watch.first(self.plant.observe(), self.plant.observe)
-        seen, halt = first.seen, first.halt
-        self.controller.reset()
+        seen, halt = watch.first(self.plant.observe(), self.plant.observe)
         self.knowledge.error.begin()
-        self.controller.tighter = float(self.knowledge.error.tighter)
+        self.controller.reset(float(self.knowledge.error.tighter))
         self._figures.begin(seen.a)
+        self._lessons.begin()
         ends = Ends(self.safety.rule, target, self.controller, seen)
         grips = turns = 0
         decision = None
@@ -221,21 +203,22 @@ class ClosedLoop:
             if halt is not None:
                 self.hold()
                 return Stop(halt.reason, seen, halt.message)
-            seen, looks = self._look(seen, ends, watch)
+            seen, looks = ends.look(seen, watch, self.plant.observe)
             over = ends.over(seen, looks, self._stop.is_set(), self.decline and decision is None)
             if over is not None:
                 if over.reason is StopReason.OBJECT_LOST:
                     self.knowledge.error.slid(lost=True)
-                why = over.message
                 if over.reason is StopReason.STALLED:
                     grip = None if decision is None else decision.grip
-                    why = (grip and grip.waits) or self._planned(seen, target).end.message
-                return Stop(over.reason, seen, why)
+                    return over.told((grip and grip.waits) or self.plan(target).end.message)
+                return over
             began = time.perf_counter()
-            if turns:
-                firm = _LEAST if grips < _AGAIN and decision is not None and decision.turns else 0.0
-            else:
-                firm = _FULL if grips < _GRIPS else _ANY if grips < _AGAIN else 0.0
+            # after a movement that turned it is gripped again where a finger is weak, or the object may spin
+            tried = max(grips, 2) if turns else grips
+            again = tried < len(_FIRM) and (decision is None or decision.turns or not turns)
+            firm = _FIRM[tried] if again else 0.0
+            if self.learn:
+                self._lessons.touch(seen, watch.motions.closest)
             plan = self.planner.plan(self.controller, seen, target, self.knowledge, firm)
             seconds, decision = time.perf_counter() - began, plan.decision
             if decision.status is not StopReason.RUNNING:
@@ -247,23 +230,6 @@ class ClosedLoop:
             step, halt = self._move(seen, decision, ends, watch, seconds)
             yield step
             seen, grips, turns = step.after, grips + (not decision.turns), turns + decision.turns
-
-    def _look(self, seen: Observation, ends: Ends, watch: Watch) -> tuple[Observation, int]:
-        """The mean of as many readings at rest as it takes to see whether the target is reached, and how many
-        these are."""
-        rule, readings, mean = self.safety.rule, [seen], seen
-        while mean.status is PlantStatus.HELD and len(readings) < rule.most_looks:
-            n, error = len(readings), ends.error(mean)
-            doubt = watch.readings.pose_noise(seen, self.controller.focus) / math.sqrt(n)
-            clear = n >= rule.looks and abs(error - rule.tolerance) > doubt
-            if clear or error > rule.tolerance + 3 * doubt:
-                break
-            another = watch.rest(seen, self.plant.observe())
-            if another is seen:
-                break
-            readings.append(another)
-            mean = mean_reading(readings)
-        return mean, len(readings)
 
     def _move(
         self, seen: Observation, decision: Decision, ends: Ends, watch: Watch, seconds: float
@@ -283,10 +249,8 @@ class ClosedLoop:
             self.plant.learn(after)
             halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
             if expected is not None and after.status is PlantStatus.HELD and self.learn:
-                if seen.status is PlantStatus.HELD:  # both ends were measured
-                    self._lessons.judge(decision, expected, increment)
-                if verdict.teaches and halt is None:
-                    report = self._lessons.learn(seen, decision, after, moved, expected)
+                teaches = verdict.teaches and halt is None
+                report = self._lessons.learn(seen, decision, after, moved, expected, teaches)
             controller.went(seen.a, decision.pieces)
             pull = figures.commit(moved, after.a)
             if decision.turns:
@@ -299,10 +263,8 @@ class ClosedLoop:
 
     def _command(self, seen: Observation, decision: Decision) -> tuple[Observation, str]:
         """Move the motors through the pieces; the reading at rest, and what stopped them on the way."""
-        ways = torch.stack([one.action for one in decision.pieces]).cumsum(0)
-        path = Path.through(
-            torch.stack([self._figures.motors(way) for way in ways]), self.safety.guards.speed
-        )
-        watch = OnTheWay(self.safety.guards, seen, decision)
+        ways, guards = torch.stack([one.action for one in decision.pieces]).cumsum(0), self.safety.guards
+        path = Path.through(torch.stack([self._figures.motors(way) for way in ways]), guards.speed)
+        watch = OnTheWay(guards, seen, decision)
         after = self.plant.send_path(path, watch, seen, "turn" if decision.turns else "grip")
         return after, watch.why

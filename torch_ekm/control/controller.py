@@ -19,8 +19,7 @@ from ..model import ContactMotion, KinematicModel, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, Piece, StopReason, made_of, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
-from .limiting import LimitingFunction, StepBound, contact_travel
-from .limits import DEFAULT_LIMITS, Limit
+from .limits import DEFAULT_LIMITS, Limit, LimitingFunction, StepBound, contact_travel
 from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
 from .situation import LinearizedModel, Situation
 from .tasks import DEFAULT_TASKS, Task
@@ -28,7 +27,7 @@ from .tasks import DEFAULT_TASKS, Task
 if TYPE_CHECKING:
     from ..estimation.force_sensitivity import ForceSensitivity
     from ..model import Linearization
-    from ..model.linearization import FollowedFigures
+    from .knowledge import HandKnowledge
 
 _BOUND = StepBound()
 _LIST = "a list of objects with a method rows(model, seen)"
@@ -99,15 +98,18 @@ class LookAndMoveController:
         self.previous: tuple[Linearization, Tensor] | None = None
         """The last linearization of this grasp whose forces were found, and the encoders there."""
 
-    def follow(self, figures: FollowedFigures) -> None:
-        """Let f of the enhanced model follow the figures of the hand as they are learned."""
-        if self.enhanced is not None and self.kinematic.figures is not figures:
-            self.kinematic = self.enhanced.model = self.kinematic.with_figures(figures)
+    def follow(self, knowledge: HandKnowledge) -> None:
+        """Let f of the enhanced model follow the figures of the hand and its forces as they are learned."""
+        if self.enhanced is None:
+            return
+        self.forces = knowledge.forces
+        if self.kinematic.figures is not knowledge.figures:
+            self.kinematic = self.enhanced.model = self.kinematic.with_figures(knowledge.figures)
 
-    def reset(self) -> None:
-        """Forget the contact forces and the tighter grip of the last grasp; a :class:`ClosedLoop` does so
-        when it begins."""
-        self.previous, self.tighter = None, 0.0
+    def reset(self, tighter: float = 0.0) -> None:
+        """Forget the contact forces of the last grasp, and grip tighter than suits the object [N]; a
+        :class:`ClosedLoop` does so when it begins."""
+        self.previous, self.tighter = None, tighter
 
     def expect(self, pieces: Sequence[Piece], moved: Float[Tensor, " n_a"]) -> Expectation:
         """``(f + g)(s, w)`` of what the tendons did in place of the pieces, and how sure g is of it.

@@ -54,7 +54,6 @@ class StopReason(Enum):
     OUT_OF_RANGE = "reading out of range"
     FINGERTIP_FAULT = "fingertip fault"
     ACTUATOR_STUCK = "actuator stuck"
-    SPEED_CEILING = "speed ceiling"
     FORCE_CEILING = "force ceiling"
 
 
@@ -134,6 +133,15 @@ class Band:
 
 
 @dataclass(frozen=True)
+class Waypoint:
+    """A piece of the path, where it leads, and how sure the model is of that."""
+
+    piece: Piece
+    state: GraspState
+    band: Band
+
+
+@dataclass(frozen=True)
 class Decision:
     """The movement that was chosen, what is predicted of it, and with which uncertainty."""
 
@@ -188,11 +196,6 @@ class Expectation(NamedTuple):
     def shares(self) -> list[float]:
         """Of the way, that each piece is."""
         return shares(self.pieces)
-
-    @property
-    def described(self) -> Float[Tensor, " n_s"]:
-        """By the hand as described, to first order [rad, m, rad]."""
-        return torch.stack([one.linearization.described_jacobian @ one.action for one in self.pieces]).sum(0)
 
 
 def shares(pieces: Sequence[Piece]) -> list[float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -10,14 +11,16 @@ from .._checks import check_kind
 from .._noise import DEGREE
 from ..exceptions import CommandRefusedError, ParameterError
 from ..plant import Observation, PlantStatus
+from ..plant.frames_at_rest import mean_reading
 from .decision import StopReason
 from .focus import A_TARGET, PoseTarget
 from .manipulation import Stop
 from .reach import out_of_reach
-from .safety.guards import Guards, Objection
+from .safety.guards import Guards
 
 if TYPE_CHECKING:
     from .controller import LookAndMoveController
+    from .safety.watch import Watch
 
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
 
@@ -77,19 +80,12 @@ class Safety:
 
 
 class Ends:
-    """Errors of one manipulation, judged by a :class:`~torch_ekm.control.StoppingRule`.
-
-    Args:
-        rule: figures.
-        target: what is to be reached.
-        controller: its focus and model.
-        seen: the first reading.
-    """
+    """Errors of one manipulation, judged by a :class:`~torch_ekm.control.StoppingRule`."""
 
     limited = False
     """The last movement was cut short by an actuator's limit."""
     surprise = ""
-    """The first reading that was believed though no motion explains it, or the one with the largest leap."""
+    """The first reading that was accepted though no motion explains it, or the one with the largest leap."""
 
     def __init__(
         self, rule: StoppingRule, target: PoseTarget, controller: LookAndMoveController, seen: Observation
@@ -104,7 +100,26 @@ class Ends:
         """|e| as a turn [rad]."""
         return self._controller.focus.error(self.target, seen.state)
 
-    def over(self, seen: Observation, looks: int, stopped: bool, declines: bool) -> Objection | None:
+    def look(
+        self, seen: Observation, watch: Watch, another: Callable[[], Observation]
+    ) -> tuple[Observation, int]:
+        """The mean of as many readings at rest as it takes to see whether the target is reached, and how many
+        these are."""
+        rule, readings, mean = self.rule, [seen], seen
+        while mean.status is PlantStatus.HELD and len(readings) < rule.most_looks:
+            n, error = len(readings), self.error(mean)
+            doubt = watch.readings.pose_noise(seen, self._controller.focus) / math.sqrt(n)
+            clear = n >= rule.looks and abs(error - rule.tolerance) > doubt
+            if clear or error > rule.tolerance + 3 * doubt:
+                break
+            further = watch.rest(seen, another())
+            if further is seen:
+                break
+            readings.append(further)
+            mean = mean_reading(readings)
+        return mean, len(readings)
+
+    def over(self, seen: Observation, looks: int, stopped: bool, declines: bool) -> Stop | None:
         """Why the manipulation ends before the next movement; None: it goes on.
 
         Args:
@@ -112,20 +127,18 @@ class Ends:
             stopped: somebody has asked for the end.
             declines: a target out of reach ends it.
         """
+        held, focus, rule = seen.status is PlantStatus.HELD, self._controller.focus, self.rule
         if seen.status is PlantStatus.LOST:
-            return Objection(StopReason.OBJECT_LOST)
-        if self._controller.focus.off_rotation(seen.state.minus(self._start)) > self.rule.off_limit:
-            return Objection(StopReason.OBJECT_LOST, "dislocated off the focused axis")
-        held = seen.status is PlantStatus.HELD
-        if looks >= self.rule.looks and held and self.error(seen) <= self.rule.tolerance:
-            return Objection(StopReason.REACHED, self.surprise if self._leap > _LEAP else "")
-        reason = self.rule.judge(self.errors, self.limited)
-        if reason is not StopReason.RUNNING:
-            return Objection(reason)
-        if stopped:
-            return Objection(StopReason.STOPPED)
+            return Stop(StopReason.OBJECT_LOST, seen)
+        if focus.off_rotation(seen.state.minus(self._start)) > rule.off_limit:
+            return Stop(StopReason.OBJECT_LOST, seen, "dislocated off the focused axis")
+        if looks >= rule.looks and held and self.error(seen) <= rule.tolerance:
+            return Stop(StopReason.REACHED, seen, self.surprise if self._leap > _LEAP else "")
+        reason = rule.judge(self.errors, self.limited)
+        if reason is not StopReason.RUNNING or stopped:
+            return Stop(StopReason.STOPPED if reason is StopReason.RUNNING else reason, seen)
         why = out_of_reach(self._controller, seen, self.target) if declines and held else ""
-        return Objection(StopReason.OUT_OF_REACH, why) if why else None
+        return Stop(StopReason.OUT_OF_REACH, seen, why) if why else None
 
     def add(self, after: Observation, limited: bool) -> None:
         """One more movement that turns."""

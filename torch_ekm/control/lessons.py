@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import statistics
+from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 
 from .._noise import NOISE
-from ..plant import Observation
+from ..contact import ContactDetector
+from ..plant import Observation, PlantStatus
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation
@@ -20,48 +23,37 @@ if TYPE_CHECKING:
 
 _SLIPS, _OF_WAY = 3.0, 0.15  # noises, and share of the way of f + g, from which an object is thought to slide
 _OF_IT, _WRONG = 0.25, 3.0  # share of what a finger bears that is no surprise; deviations that are one
+_SENSED = 1e-3  # [m] of the surface, below which sensors are thought to be off: three deviations of a median
 
 
-class ForceSurprise(NamedTuple):
-    """What the pads in contact measured after a movement, against the prediction."""
+class ForceChange(NamedTuple):
+    """What the pads in contact measured after a movement."""
 
-    pads: tuple[int, ...]
-    change: Float[Tensor, " n_c"]
-    """Of what they read [N]; NaN where a pad does not measure, or has let go."""
-    surprise: Float[Tensor, " n_c"]
-    """Measured less predicted [N]; NaN likewise."""
-    gone: Tensor
-    """Which pads measured before the movement, and do not now ``(n_c,)``."""
-
-    def wrong(self, before: Observation) -> bool:
-        """Some pad measured what was not predicted, or has let go."""
-        assert before.fingertip_force is not None
-        noise = (NOISE.force**2 + (_OF_IT * before.fingertip_force[list(self.pads)]).square()).sqrt()
-        return bool((self.surprise.abs() > _WRONG * noise).any() or self.gone.any())
+    change: Float[Tensor, " n_pads"]
+    """Of what they read [N]; NaN of a pad that did not measure before and after."""
+    wrong: bool
+    """Some pad measured what was not predicted, or has let go."""
 
 
 def felt(
     hand: HandDescription, expected: Expectation, before: Observation, after: Observation
-) -> ForceSurprise | None:
+) -> ForceChange | None:
     """Of a movement; None: no pad measures."""
-    if before.fingertip_force is None or after.fingertip_force is None or expected.normal is None:
+    was, now = before.fingertip_force, after.fingertip_force
+    if was is None or now is None or expected.normal is None:
         return None
-    _, pads = hand.pad_rows(expected.pieces[0].linearization.contacts.finger)
-    was, now = before.fingertip_force[pads], after.fingertip_force[pads]
-    touched, touches = was >= NOISE.pressing, now >= NOISE.pressing  # one that reads less may be dead
-    both, nothing = touched & touches, now.new_full((), torch.nan)
-    surprise = (now - expected.normal[pads]).where(both, nothing)
-    return ForceSurprise(tuple(pads), (now - was).where(both, nothing), surprise, touched & ~touches)
+    held = torch.zeros_like(was, dtype=torch.bool)
+    held[hand.pad_rows(expected.pieces[0].linearization.contacts.finger)[1]] = True
+    # one that reads less may be dead
+    touched, touches = held & (was >= NOISE.pressing), now >= NOISE.pressing
+    both, noise = touched & touches, (NOISE.force**2 + (_OF_IT * was).square()).sqrt()
+    surprise = ((now - expected.normal).abs() > _WRONG * noise) & both
+    return ForceChange((now - was).where(both, torch.nan), bool((surprise | (touched & ~touches)).any()))
 
 
 class Lessons:
-    """Of one loop.
-
-    Args:
-        controller: its enhanced model learns, if it has one.
-        knowledge: of the hand, which learns with it.
-        figures: those of the knowledge, or of a hand as described.
-    """
+    """Of one loop: the enhanced model of the controller learns, if it has one, the knowledge of the hand, and
+    the figures, which are those of the knowledge or of a hand as described."""
 
     def __init__(
         self,
@@ -70,17 +62,32 @@ class Lessons:
         figures: HandFigures | DescribedFigures,
     ) -> None:
         self._controller, self._knowledge, self._figures = controller, knowledge, figures
+        self._gaps: list[float] = []  # [m]
 
-    def judge(self, decision: Decision, expected: Expectation, increment: Float[Tensor, " n_s"]) -> None:
-        """How far a movement ended from its prediction: the share of :class:`ModelError`, and a tighter grip
-        of an object that slides."""
-        off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
-        if decision.turns:
-            self._knowledge.error.see(off, way)
-            of_way = NOISE.described if self._controller.enhanced is None else _OF_WAY
-            if float(off.norm()) > _SLIPS * NOISE.rotation + of_way * float(way.norm()):
-                self._knowledge.error.slid()
-                self._controller.tighter = float(self._knowledge.error.tighter)
+    def begin(self) -> None:
+        """A manipulation begins; the object may be another one."""
+        self._gaps, self._controller.kinematic.surface = [], 0.0
+
+    def touch(self, seen: Observation, otherwise: Callable[[Observation], float]) -> None:
+        """Where the object's surface is, by the gaps of the pads that press: the median of each reading, for
+        one pad may be off alone, and the mean of readings.
+
+        Args:
+            otherwise: what another explanation of the gaps leaves of them, rms [m]; the better one counts.
+        """
+        model = self._controller.kinematic
+        names = model.pressing(seen.fingertip_force)
+        if not (self._figures.learns and names and isinstance(model.detector, ContactDetector)):
+            return
+        found = model.detector(seen.q, seen.position, seen.rotation, names)
+        gaps = [g for name, g in zip(found.finger, found.gap.tolist(), strict=True) if name in names]
+        if len(gaps) > 1:
+            median = statistics.median(gaps)
+            if abs(median) > _SENSED and statistics.pstdev(gaps) > otherwise(seen):
+                return
+            self._gaps.append(median)
+            mean = statistics.fmean(self._gaps)
+            model.surface = mean if abs(mean) > _SENSED else 0.0
 
     def learn(
         self,
@@ -89,23 +96,35 @@ class Lessons:
         after: Observation,
         moved: Float[Tensor, " n_a"],
         expected: Expectation,
+        teaches: bool,
     ) -> UpdateReport | None:
-        """Forces, figures and g learn; None: the controller has no learner.
+        """The share of :class:`ModelError`, and a tighter grip of an object that slides; then forces, figures
+        and g; None: g learns nothing.
 
         Args:
             moved: by the encoders [rad].
             expected: of that.
+            teaches: nothing speaks against the readings.
         """
-        controller = self._controller
-        if controller.enhanced is None:
+        controller, error, increment = self._controller, self._knowledge.error, after.state.minus(seen.state)
+        if decision.turns and seen.status is PlantStatus.HELD:  # both ends were measured
+            off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
+            error.see(off, way)
+            of_way = NOISE.described if controller.enhanced is None else _OF_WAY
+            if float(off.norm()) > _SLIPS * NOISE.rotation + of_way * float(way.norm()):
+                error.slid()
+                controller.tighter = float(error.tighter)
+        if controller.enhanced is None or not teaches:
             return None
         if not self._knowledge.servo.learns:  # then the dead zones are g's to learn
             moved = decision.delta_a
             expected = controller.expect(decision.pieces, self._figures.pulled(moved))
-        surprise = felt(controller.kinematic.hand, expected, seen, after)
-        if surprise is not None and not surprise.wrong(seen):  # else a finger slid, or a link took its load
-            self._learn_forces(expected, surprise)
-        return self.learn_increment(expected, moved, after.state.minus(seen.state))
+        forces, came = self._knowledge.forces, felt(controller.kinematic.hand, expected, seen, after)
+        said = [one.said for one in expected.pieces if one.said is not None]
+        if said and came is not None and not came.wrong:  # else a finger slid, or a link took its load
+            turned = sum(float(one.increment[-3:].norm()) for one in expected.pieces)
+            forces.update(expected.moved, came.change, torch.stack(said).sum(0), turned)
+        return self.learn_increment(expected, moved, increment)
 
     def learn_increment(
         self, expected: Expectation, moved: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
@@ -128,11 +147,3 @@ class Lessons:
             report = enhanced.update(state, one.action, one.increment + share * rest, nominal)
             done += share
         return report
-
-    def _learn_forces(self, expected: Expectation, surprise: ForceSurprise) -> None:
-        forces, said = self._knowledge.forces, [one.said for one in expected.pieces if one.said is not None]
-        change = torch.full_like(forces.by_way, torch.nan)
-        change[list(surprise.pads)] = surprise.change
-        way = sum(float(one.increment[-3:].norm()) for one in expected.pieces)
-        if said:
-            forces.update(expected.moved, change, torch.stack(said).sum(0), way)

@@ -15,7 +15,7 @@ from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
 from .bands import DEVIATIONS, Band, Bands, lets_go
-from .decision import Decision, Piece, StopReason
+from .decision import Decision, StopReason, Waypoint
 from .focus import FocusedPose, PoseTarget
 from .rehearsal import LONGEST, End, PathEnd, Rehearsal
 
@@ -29,15 +29,6 @@ _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was
 _BACK = 1.5  # times off_rotation from which an object that is farther off is not turned back: it slips out
 _GRIP = 3  # pieces of a movement that grips: pads that read wrong are seen after it
 _CLOSE = 0.3 * DEGREE  # [rad] from which one is enough
-
-
-@dataclass(frozen=True)
-class Waypoint:
-    """A piece of the path, where it leads, and how sure the model is of that."""
-
-    piece: Piece
-    state: GraspState
-    band: Band
 
 
 @dataclass(frozen=True)
@@ -76,10 +67,7 @@ class Plan:
         """
         from .plan_figure import draw  # matplotlib is needed only here
 
-        bands, row = [one.band for one in self.waypoints], self.focus.matrix[0]
-        stds = [float((row.square() * band.twist_std.square()).sum().sqrt()) for band in bands]
-        grasps = [one.piece.linearization for one in self.waypoints]
-        return draw(self.errors[1:], stds, bands, grasps, self.safe)
+        return draw(self.errors[1:], self.focus.matrix[0], self.waypoints, self.safe)
 
     def __str__(self) -> str:
         errors = [error / DEGREE for error in self.errors]

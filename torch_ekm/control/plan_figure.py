@@ -12,35 +12,27 @@ from .._noise import DEGREE
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ..model import Linearization
-    from .decision import Band
+    from ..typing import Float, Tensor
+    from .decision import Waypoint
 
 _STYLE = "torch_ekm.style"
 _PANELS = "to go [deg]", "off the axis [deg]", "share of the friction left", "normal forces [N]"
 
 
 def draw(
-    errors: Sequence[float],
-    stds: Sequence[float],
-    bands: Sequence[Band],
-    grasps: Sequence[Linearization],
-    safe: int,
+    errors: Sequence[float], row: Float[Tensor, " 6"], waypoints: Sequence[Waypoint], safe: int
 ) -> Figure:
-    """See :meth:`~torch_ekm.control.Plan.draw`.
-
-    Args:
-        errors, stds: focused error at each waypoint, and its deviation [rad].
-        bands: there.
-        grasps: where the pieces begin.
-        safe: waypoints that may be passed.
-    """
+    """See :meth:`~torch_ekm.control.Plan.draw`; focused errors [rad] at the waypoints, the row of M_c."""
+    bands = [one.band for one in waypoints]
+    stds = [float((row * band.twist_std).norm()) for band in bands]
     with require("matplotlib.style").context(_STYLE):
         # a Figure of its own: pyplot would keep it alive and touch the caller's backend
         figure = require("matplotlib.figure").Figure(figsize=(8.0, 5.0), layout="constrained")
         panels = figure.subplots(2, 2, sharex=True).ravel().tolist()
     _line(panels[0], [error / DEGREE for error in errors], [std / DEGREE for std in stds])
     _line(panels[1], [band.off / DEGREE for band in bands], [band.off_std / DEGREE for band in bands])
-    left = [_margins(lin) for lin in grasps]
+    grasps = [one.piece.linearization for one in waypoints]
+    left = [dict(zip(a.contacts.finger, a.forces.relative_margin.tolist(), strict=True)) for a in grasps]
     for name in dict.fromkeys(name for one in left for name in one):
         _line(panels[2], [one.get(name, math.nan) for one in left], label=name)
     forces = [band.force for band in bands if band.force is not None]
@@ -57,10 +49,6 @@ def draw(
     if left:
         panels[2].legend()
     return figure
-
-
-def _margins(lin: Linearization) -> dict[str, float]:
-    return dict(zip(lin.contacts.finger, lin.forces.relative_margin.tolist(), strict=True))
 
 
 def _line(axes: Any, middle: Sequence[float], std: Sequence[float] | None = None, label: str = "") -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from .._extras import require
 from .._noise import DEGREE
-from ..contact.forces.active_set import EqualityProgram, solve_by_active_set
+from ..contact.forces.solve import EqualityProgram, solve_by_active_set
 from ..exceptions import NonFiniteError, ParameterError, ShapeError, SolverError
 from ..typing import Array, Tensor
 

@@ -9,13 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from .._checks import check_kind
 from .._noise import DEGREE
 from ..exceptions import GraspError, ParameterError
 from ..plant import Observation
-from ..typing import Float, Tensor
 from .controller import LookAndMoveController
-from .focus import A_TARGET, FocusedPose, PoseTarget
+from .focus import FocusedPose, PoseTarget
 from .limits import ActuatorLimit
 from .plan import Plan, WholeTurn
 from .rehearsal import End
@@ -62,23 +60,20 @@ def reach(
     return Reach(turned[-1], plan.end, turned[plan.safe], plan)
 
 
-@dataclass(frozen=True)
-class Reachability:
-    """``M_c D E_p J_m = U diag(gains) V^T``: what J_m says of a target; D counts 0.8 mm as 1 deg."""
-
-    gains: Float[Tensor, " n_x"]
-    """Turn of the object for a turn of the motors, the largest first: they give rank and conditioning."""
-    reason: str = ""
-    """Why the target is not reachable; empty: it is, as far as J_m says."""
-
-
 @torch.no_grad()
-def reachability(controller: LookAndMoveController, seen: Observation, target: PoseTarget) -> Reachability:
-    """See :meth:`~torch_ekm.control.ClosedLoop.reachability`."""
+def out_of_reach(controller: LookAndMoveController, seen: Observation, target: PoseTarget) -> str:
+    """Why motors cannot bring an object to a target; empty: they can, as far as J_m says.
+
+    Two tests, of first order: the motors hold each direction of the focus, by the singular values of
+    ``M_c D E_p J_m`` with D that counts 0.8 mm as 1 deg; and their whole ranges come as far as the target.
+    """
     focus, hand = controller.focus, controller.kinematic.hand
-    lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    try:
+        lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    except GraspError:  # the loop will say so itself
+        return ""
     D = torch.tensor([1250 * DEGREE] * 3 + [1.0] * 3, dtype=torch.float64)
-    asked = focus.matrix @ (D * check_kind("target", target, PoseTarget, A_TARGET).error(seen.state))
+    asked = focus.matrix @ (D * target.error(seen.state))
     limits = (limit for limit in controller.limits if isinstance(limit, ActuatorLimit))
     moves = next(limits, ActuatorLimit()).moves(hand)
     scaled = (D[:, None] * lin.object_jacobian)[:, torch.from_numpy(moves)]
@@ -89,21 +84,13 @@ def reachability(controller: LookAndMoveController, seen: Observation, target: P
         parts = sorted(zip(U[:, -1].abs().tolist(), map(str, focus.directions), strict=True), reverse=True)
         weak = " with ".join(name for share, name in parts if share > 0.3)
         few = f"the motors hold {int(held.sum())} of the {len(gains)} directions of the focus"
-        return Reachability(gains, f"{few}, and too little of {weak}: leave a direction out")
+        return f"{few}, and too little of {weak}: leave a direction out"
     room = torch.from_numpy((hand.actuator_upper - hand.actuator_lower)[np.flatnonzero(moves)])
     share = float((asked @ focus.matrix @ scaled).abs() @ room / (asked @ asked).clamp(min=1e-9))
     if bool(held.all()) and share >= 1:  # the path of a turn about one axis says more
-        return Reachability(gains)
-    most = f"to first order the whole ranges of the motors come {100 * min(share, 1):.0f} % of the way"
-    return Reachability(gains, f"{most}: choose a nearer target, or another direction")
-
-
-def out_of_reach(controller: LookAndMoveController, seen: Observation, target: PoseTarget) -> str:
-    """Why a target is declined; empty: it is not."""
-    try:
-        return reachability(controller, seen, target).reason
-    except (ParameterError, GraspError):  # the loop will say so itself
         return ""
+    most = f"to first order the whole ranges of the motors come {100 * min(share, 1):.0f} % of the way"
+    return f"{most}: choose a nearer target, or another direction"
 
 
 def _is_turn(focus: FocusedPose) -> bool:

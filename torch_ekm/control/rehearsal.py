@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 
 from .._noise import DEGREE
-from ..exceptions import GraspError, NoContactError, UnstableGraspError
+from ..exceptions import NoContactError, UnstableGraspError
 from ..kinematics import GraspState
 from ..model.softening import softened
 from ..plant import Observation
@@ -19,7 +19,7 @@ from ..typing import Tensor
 from .bands import lets_go
 from .decision import Decision, Piece, StopReason
 from .focus import PoseTarget
-from .limiting import LimitingFunction
+from .limits import LimitingFunction
 from .model_hand import ModelHand
 
 if TYPE_CHECKING:
@@ -93,7 +93,6 @@ class Rehearsal:
         self.first: Decision | None = None
         """The first one, with the grip before anything moves."""
         self.last: Decision | None = None
-        self._failure: GraspError | None = None
         self._too_long, self._most = False, math.inf
 
     @torch.no_grad()
@@ -101,19 +100,16 @@ class Rehearsal:
         """Each piece, and where it leads."""
         controller, hand, way = self._controller, self.hand, torch.zeros_like(self.hand.a)
         for _ in range(_MOST):
-            if hand.failure is not None:
-                self._failure = hand.failure
-                return
             here = hand.observe()
-            if self._there(here.state):
+            if hand.failure is not None or self._there(here.state):
+                return
+            lin = hand.linearization
+            if lin is None:
                 return
             force = controller.believed(here.a, here.fingertip_force if self._measures else None)
-            if hand.linearization is None:
-                self._failure = hand.failure
-                return
             if self.first is None:
-                self._most = self._bears(hand.linearization)
-            lin = controller.corrected(hand.linearization)
+                self._most = self._bears(lin)
+            lin = controller.corrected(lin)
             self.last = decision = self._decide(here, force, lin)
             self.first = self.first or decision
             if decision.status is not StopReason.RUNNING or (self._target is None and _gripped(decision)):
@@ -162,7 +158,7 @@ class Rehearsal:
     @property
     def end(self) -> End:
         """What ended the path, or keeps it from coming nearer."""
-        hand, failure = self.hand, self._failure
+        hand, failure = self.hand, self.hand.failure
         if self._target is None or self._there(hand.state):
             return End()
         if isinstance(failure, NoContactError):

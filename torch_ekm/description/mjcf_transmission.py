@@ -137,8 +137,8 @@ class MjcfTransmission:
             table["mjcf_tendons"] = {self._tendon_name(way): sign * gear}
         table["tendon"] = bool(pulls_back or low >= 0)
         if tendon is not None and np.abs(row).max() < 0.1:
-            told = "plants and models count in its largest arm"
-            self._note(f"these count in the length of their tendon, not in rad; {told}", name)
+            counted = "plants and models count in its largest arm"
+            self._note(f"these count in the length of their tendon, not in rad; {counted}", name)
         self._drives.append(row)
         return table
 

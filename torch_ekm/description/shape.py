@@ -37,6 +37,12 @@ class Shape:
         transform[:3, 3] *= factor
         return Shape(self.kind, tuple(factor * size for size in self.size), transform)
 
+    def grown(self, distance: float) -> Shape:
+        """The shape with its surface farther out by ``distance`` [m], edges kept."""
+        both = {"box": (2, 2, 2), "cylinder": (1, 2), "sphere": (1,), "capsule": (1, 0)}[self.kind]
+        size = tuple(max(one + k * distance, _SAME) for one, k in zip(self.size, both, strict=True))
+        return Shape(self.kind, size, self.transform)
+
 
 def merge_capsules(shapes: tuple[Shape, ...]) -> tuple[Shape, ...]:
     """Read a cylinder with a ball of the same radius on either end as one capsule.

@@ -60,7 +60,7 @@ _PADS = """
 # from start to end [m]. direction: outward, the middle of the side that touches. Pads that are simulated need
 # the same shape as <collision> in the URDF: a cylinder with a ball on either end, or a sphere.
 # A pinch in simulation is of the pad whose name begins with thumb, else of the one that faces the others
-# best; it presses against index* and middle*, else against all others.
+# best; it presses against index* and middle*, where both are there, else against all others.
 """
 
 

@@ -177,7 +177,7 @@ def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
 
     left = [place for key, value in data.items() for place in places(value, key)]
     if left:
-        raise DescriptionError(path, f"still to be filled in ({len(left)} figures): {', '.join(left)}")
+        raise DescriptionError(path, f"still to be filled in: {', '.join(left)}")
 
 
 def _each(top: TomlTable, key: str, read: Callable[[str, Any], T]) -> list[T]:

@@ -5,14 +5,14 @@ Tested against the genuine protocols; none was tried on hardware.
 
 from __future__ import annotations
 
-from .bus_reading import BusReading
 from .driver import HandDriver
 from .dynamixel import DynamixelPlant
+from .dynamixel_port import SERVOS, Servo
 from .emulated import EmulatedPlant
+from .gathered import BusReading
 from .opening import open_driver
 from .pose import MarkerPose, Sighting, WithPose
 from .ros2 import Ros2Plant, RosPose
-from .servos import SERVOS, Servo
 from .wiring import Channel, Limits, Wiring
 from .yarp import YarpPlant
 

@@ -19,8 +19,8 @@ from ..kinematics.tensors import as_tensors
 from ..plant import Observation, PlantStatus, Stamps
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
-from .bus_reading import BusReading
-from .posture import Posture
+from .gathered import BusReading
+from .pose import Posture
 from .wiring import Channel, Wiring
 
 _REACH = 0.08  # [s] a motion goes out in pieces of so much: a hand whose computer dies goes no farther

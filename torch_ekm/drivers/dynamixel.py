@@ -9,10 +9,9 @@ from typing import Any
 
 from ..description import HandDescription
 from ..exceptions import BusError
-from .bus_reading import BusReading
 from .driver import HandDriver
-from .dynamixel_port import DynamixelPort
-from .servos import SERVOS, Servo
+from .dynamixel_port import SERVOS, DynamixelPort, Servo
+from .gathered import BusReading
 
 _TURN = 4096
 _TICKS = _TURN / (2 * math.pi)  # per rad
@@ -166,7 +165,7 @@ class DynamixelPlant(HandDriver):
         return mode, current_ma
 
     def _within_limits(self) -> None:
-        """In mode 3 a servo takes no goal beyond its limits, and says nothing."""
+        """In mode 3 a servo takes no goal beyond its limits, without an error."""
         for one, found in zip(self.wiring.motors, self._found, strict=True):
             low, high = found["Min Position Limit"], found["Max Position Limit"]
             least, most = sorted(round(one.bus(x)) for x in (one.lower, one.upper))

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from ..kinematics import ActuationMap
-from .bus_reading import BusReading
 from .driver import HandDriver
+from .gathered import BusReading
 from .wiring import Wiring
 
 

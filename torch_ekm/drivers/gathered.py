@@ -3,9 +3,30 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from ..exceptions import BusError
+
+
+@dataclass(frozen=True)
+class BusReading:
+    """What a bus says, in its own units, in the order of the wiring; times of ``time.monotonic()`` [s]."""
+
+    motors: Sequence[float]
+    taken: float
+    """When the motors were read."""
+    moving: bool = False
+    """The bus reports that a motor moves; False: it does not, or does not report it."""
+    joints: Sequence[float] = ()
+    joints_taken: float = math.inf
+    fingertips: Sequence[float] = ()
+    fingertips_taken: float = math.inf
+    load: Sequence[float] = ()
+    """Current or torque of each motor, for ``Observation.info`` [unit of the bus]."""
+    oldest: str = ""
+    """Which motor's reading is the oldest, where they come one by one: for errors."""
+
 
 _SAME = 0.5  # [s] messages that are later from the first one on come from a clock that is behind
 _DRIFT = 2e-4  # that clocks part from each other
@@ -24,7 +45,7 @@ class Value(NamedTuple):
 class SenderClock:
     """How far a sender's clock is off ours: by the least that a message was ever late, less their drift.
 
-    What all messages have in common, their latency or the clocks' difference, cannot be told apart: up to
+    What all messages have in common, their latency or the clocks' difference, cannot be distinguished: up to
     0.5 s it counts as latency, more and what is negative as difference.
     """
 

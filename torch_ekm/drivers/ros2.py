@@ -14,9 +14,8 @@ import torch
 from .._extras import require
 from ..description import HandDescription
 from ..exceptions import BusError
-from .bus_reading import BusReading
 from .driver import HandDriver
-from .gathered import Gathered, Value
+from .gathered import BusReading, Gathered, Value
 from .one_master import OneMaster
 from .pose import Sighting
 from .wiring import Channel
@@ -146,7 +145,7 @@ class Ros2Plant(HandDriver):
     # -- what arrives -------------------------------------------------------------------------------
 
     def subscribe(self, kind: Any, topic: str, take: Callable[[Any, Any], None]) -> None:
-        """``take`` gets each message and what the middleware knows of it, in the wiring's quality."""
+        """``take`` gets each message and its sender as the middleware states it, in the wiring's quality."""
         informs = hasattr(require("rclpy.subscription").Subscription, "CallbackType")  # since ROS 2 Iron
         back = take if informs else lambda message: take(message, {})
         self.node.create_subscription(kind, topic, back, self._quality)
@@ -183,7 +182,7 @@ class Ros2Plant(HandDriver):
 
     def _take(self, message: Any, info: Any) -> None:
         parts = {"position": message.position, "velocity": message.velocity, "effort": message.effort}
-        sender = sender_of(info) or tuple(message.name)  # where the middleware does not tell, what it sends
+        sender = sender_of(info) or tuple(message.name)  # where the middleware names none, what it sends
         self._states.take(message.name, parts, sender, *self.lateness(message.header, info))
 
     def _take_force(self, message: Any, info: Any) -> None:
@@ -274,7 +273,7 @@ class Ros2Plant(HandDriver):
 
 
 def sender_of(info: Any) -> Any:
-    """Which publisher a message is of, as far as the middleware tells."""
+    """Which publisher a message is of, as far as the middleware states it."""
     return (info.get("publisher_gid") or {}).get("data")
 
 

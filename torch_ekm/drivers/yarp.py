@@ -12,8 +12,8 @@ from typing import Any
 
 from ..description import HandDescription
 from ..exceptions import BusError
-from .bus_reading import BusReading
 from .driver import HandDriver
+from .gathered import BusReading
 from .one_master import OneMaster
 
 _TIMEOUT = 1.0  # [s]

@@ -18,9 +18,9 @@ from ..residual.base import ResidualLearner
 from ..residual.kernels.action_linear import ActionLinearKernel
 from ..residual.report import Expected, UpdateReport
 from ..typing import Float, Tensor
+from .adaptive_model import differentiated, finite_differences
 from .encoding import GraspEncoding
 from .grasp_learner import grasp_learner
-from .model_jacobian import differentiated, finite_differences
 
 if TYPE_CHECKING:
     from ..model import KinematicModel

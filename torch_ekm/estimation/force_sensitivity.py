@@ -14,7 +14,7 @@ from .._checks import check_finite, check_kind, check_shape
 from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..typing import Array, Float, Tensor
-from .update import update
+from .parameter_filter import update
 
 _PRIOR_STD = 20.0  # [N/rad] of an entry of B
 _WAY_STD = 10.0  # [N/rad] of an entry of l

@@ -16,7 +16,7 @@ from .._noise import NOISE
 from .._recorded import Recorded
 from ..description import HandDescription
 from ..exceptions import GraspError, StateError
-from ..kinematics.play import Play, PlayState
+from ..kinematics.servo_model import Play, PlayState
 from ..model import Linearization
 from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
 from ..model.motion_equations import Motion, MotionEquations

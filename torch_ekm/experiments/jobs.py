@@ -12,6 +12,7 @@ import json
 import os
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -23,6 +24,7 @@ from .._extras import require
 from .._files import WriterLock, make_folder, write_whole
 from .._warnings import warn
 from ..exceptions import WorkerDiedError
+from ..residual import warm_up
 
 Jobs = Mapping[str, tuple[Any, ...]]
 Outcomes = Generator[tuple[str, Any], None, None]
@@ -71,6 +73,8 @@ def run_jobs(
         for name in results:
             report(name)
         waiting = {name: arguments for name, arguments in jobs.items() if name not in results}
+        if waiting:
+            warm_up()  # else results would depend, by rounding, on when the loops are compiled
         with closing(_in_processes(processes, function, waiting)) as outcomes:
             for name, result in outcomes:
                 text = _text(name, result)
@@ -139,7 +143,8 @@ def _in_processes(processes: int, function: Callable[..., Any], jobs: Jobs) -> O
 def _watching(parent: int) -> Callable[[], None]:
     """Ends a process when its parent has: killed, a parent gives no notice.
 
-    A local function goes to the process by value, which so imports what its jobs need and no more.
+    A local function goes to the process by value, which so imports what its jobs need and no more. What is
+    compiled in the background is no news of a job.
     """
 
     def watch() -> None:
@@ -148,6 +153,7 @@ def _watching(parent: int) -> Callable[[], None]:
         os._exit(1)
 
     def begin() -> None:
+        warnings.filterwarnings("ignore", "a process in the background compiles loops")
         if os.name != "nt":  # there a process keeps the number of a parent that is gone
             threading.Thread(target=watch, daemon=True).start()
 

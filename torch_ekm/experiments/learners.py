@@ -86,7 +86,6 @@ _MIXED = (
 )
 _ON_A_HAND = _sparse(robust=3.0, forgetting_factor=0.995)
 _FRESH: dict[str, Any] = {**_AS_GIVEN, "forgetting_factor": 0.99, "robust": 3.0}
-_LEARNING = [residual.LearnHyperparameters()]
 
 #: Name -> ``factory(in_features, out_features, n_actions=0, capacity=100, **options)``; the last n_actions
 #: inputs are an action. Inputs and outputs are of the order of 1; all but the first three start from the same
@@ -103,12 +102,6 @@ LEARNERS: dict[str, Factory] = {
     "SOGP default": _kind(residual.SparseOnlineGP, "capacity"),
     "SOGP plain": _sparse(),  # nothing forgotten, every sample trusted
     "SOGP": _sparse(forgetting_factor=0.99, robust=3.0),
-    "SOGP adaptive": _sparse(
-        forgetting_factor=0.99, robust=3.0, parts=[residual.CalibrateNoise(), *_LEARNING]
-    ),
-    "SOGP detecting": _sparse(
-        robust=3.0, parts=[residual.CalibrateNoise(), residual.DetectChanges(), *_LEARNING]
-    ),
     # no forgetting: what features are learned from is the past
     "SOGP deep": _sparse(
         residual.DeepKernelSOGP,

@@ -108,8 +108,8 @@ class TrialRecord(Trial):
             StateError: a figure is missing, or there is one that the record does not have.
         """
         if wrong := {field.name for field in dataclasses.fields(cls)} ^ set(figures):
-            told = f"missing or unknown: {', '.join(sorted(wrong))}; remove results of another version"
-            raise StateError(f"the record has not the figures of {cls.__name__}: {told}")
+            wrong_names = f"missing or unknown: {', '.join(sorted(wrong))}; remove results of another version"
+            raise StateError(f"the record has not the figures of {cls.__name__}: {wrong_names}")
         given: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in figures.items()}
         return cls(**given)
 
@@ -164,5 +164,5 @@ class TrialRecord(Trial):
 
 def true_state(seen: Observation) -> GraspState:
     """Joint angles and pose as they are; for reports only."""
-    assert seen.truth is not None  # a simulated hand knows
+    assert seen.truth is not None  # of a simulated hand
     return seen.truth.state

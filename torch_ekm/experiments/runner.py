@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -132,9 +132,8 @@ class Bench:
         *,
         learn: bool = True,
         events: Sequence[Tug | PlantChange] = (),
-        blind_deg: float = 0.0,
+        touch: bool | None = None,
         poses: bool = False,
-        **blind: Any,
     ) -> TrialRecord:
         """Turn the object that is held.
 
@@ -142,28 +141,18 @@ class Bench:
             start: from where, as measured.
             learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
-            blind_deg: the camera is off for this last part of the turn [deg]; infinite: for all of it.
+            touch: without a camera, with touch or by prediction alone; None: with the camera.
             poses: keep the true poses, for pictures.
-            blind: options of :class:`~torch_ekm.foresight.BlindPose`; its ``touch`` is off.
         """
         now = self.disturbed.count
         self.disturbed.events = tuple(dataclasses.replace(event, at=event.at + now) for event in events)
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
         plant = self.plant
-        if blind_deg:
-            plant = BlindPose(
-                plant,
-                self._predictor,
-                axis,
-                # rotation off the axis does not keep the camera on: a model that tilts is not to be helped
-                switch_off=lambda seen: abs(float(axis @ target.error(seen.state)[3:])) <= blind_deg * _DEG,
-                **{"touch": False, **blind},
-            )
+        if touch is not None:
+            plant = BlindPose(plant, self._predictor, axis, touch=touch)
         self.last = self.closed_loop(plant, learn=learn).run(target)
-        if (
-            self.last.stop.cause is not None
-        ):  # one that Ctrl-C or a failure of the plant cut short is no trial
+        if self.last.stop.cause is not None:  # Ctrl-C, or a failure of the plant: this is no trial
             raise self.last.stop.cause
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
 
@@ -204,6 +193,27 @@ class Bench:
         )
 
 
+def new_objects(
+    make: Callable[[str], Bench],
+    items: Sequence[str],
+    seed: int,
+    *,
+    angles: Sequence[float],
+    kind: str = "turn",
+) -> list[TrialRecord]:
+    """The hand is learned with the first object; then turns of the others, which it has never held."""
+    records, knowledge = [], None
+    for k, item in enumerate(items):
+        bench = make(item)
+        bench.knowledge = knowledge = bench.knowledge if knowledge is None else knowledge
+        if k:
+            records += [bench.trial(seed, j, angle, kind) for j, angle in enumerate(angles)]
+        elif bench.learns:
+            records += bench.learn_hand(seed)
+        bench.close()
+    return records
+
+
 def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting) -> Plant:
     from ..sensing import ContactAligned  # OpenCV is needed only here
     from ..simulation import HallSensors, SensedPlant
@@ -211,7 +221,7 @@ def _sensed(plant: DisturbedPlant, simulated: SimulatedHand, setting: Setting) -
     hand, stuck = simulated.hand, setting.parameters.stuck_joints
     hall = HallSensors(hand) if hand.hall_sensors else None
     sensed = SensedPlant(plant, hand, simulated.object, hall=hall)
-    if hall is not None:  # after the calibration: a channel that was dead by then would not be believed
+    if hall is not None:  # after the calibration: a channel that was dead by then would be invalid
         hall.stuck = {k: math.nan for k, joint in enumerate(hall.joints) if joint in stuck}
     rested = FramesAtRest(sensed, setting.frames)
     return rested if hall is None else ContactAligned(rested, hand, simulated.object)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 
 from ..control.safety import Guards
-from ..control.safety.readings import ReadingTests
+from ..control.safety.readings import ReadingTests, stated
 from ..enhanced import EnhancedModel
 from ..exceptions import ParameterError
 from ..model import KinematicModel
@@ -64,9 +64,9 @@ class BlindPose(PlantWrapper):
         self.dark, self.looks = False, 0
         """The camera is off; how often it was asked since."""
         self._tests = ReadingTests(Guards(), self.filter.kinematic.hand)
-        self._sent: Tensor | None = None  # of a motion from which no reading was believed yet
+        self._sent: Tensor | None = None  # waypoints of motions from which no reading was accepted yet
         self._before: Observation | None = None
-        """As measured, the last reading that was believed."""
+        """As measured, the last reading that was accepted."""
 
     @property
     def axis_std(self) -> float:
@@ -81,32 +81,34 @@ class BlindPose(PlantWrapper):
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the actuators by ``delta_a`` [rad], wait, read the sensors that are on."""
         after = self.plant.command(delta_a)
-        self._sent = delta_a if self._sent is None else self._sent + delta_a
+        last = self._sent if self._sent is not None else delta_a.new_zeros(1, len(delta_a))
+        self._sent = torch.cat([last, last[-1:] + delta_a])
         return self.observation(after)
 
     def observation(self, seen: Observation) -> Observation:
         """``seen``, with the estimated state while the camera is off; a reading that :class:`Guards` refuse
         changes nothing of the estimate."""
         before, guards = self._before, self._tests.guards
-        believed = not self._tests.motors(before, self._sent, seen)
+        accepted = not self._tests.motors(before, self._sent, seen)
         if not self.dark:
             self._before, self._sent = seen, None
             self.dark = self._switch_off is None or self._switch_off(seen)
             if self.dark:
-                self.filter.start(seen.state, seen.fingertip_force, _covariance(seen))
+                self.filter.start(seen.state, seen.fingertip_force, stated(seen))
             return seen
-        if believed:
+        if accepted:
             if self._sent is not None and before is not None:
                 self.filter.move(seen.a - before.a, before.fingertip_force)
             self._before, self._sent = seen, None
             if float((seen.q - self.filter.state.q).abs().max()) <= guards.joint_jump:
                 self.filter.measure(seen.q, seen.fingertip_force)
-        looked = believed and self.axis_std > self.look_again and seen.status is PlantStatus.HELD
+        looked = accepted and self.axis_std > self.look_again and seen.status is PlantStatus.HELD
         if looked:
             self.looks += 1
-            self.filter.look(seen.state, _covariance(seen))
+            self.filter.look(seen.state, stated(seen))
         at, P = self.filter.state, self.filter.pose_covariance
         estimate = {"pose_covariance": P, "axis_std": self.axis_std, "looked": looked}
+        estimate = seen.info.get("estimate", {}) | estimate
         # a dark camera cannot say that it does not see the object
         status = PlantStatus.HELD if seen.status is PlantStatus.NOT_SEEN else seen.status
         # estimated for now: it is no stale picture
@@ -118,9 +120,5 @@ class BlindPose(PlantWrapper):
             rotation=at.rotation,
             status=status,
             stamps=stamps,
-            info={**seen.info, "estimate": {**seen.info.get("estimate", {}), **estimate}},
+            info={**seen.info, "estimate": estimate},
         )
-
-
-def _covariance(seen: Observation) -> Tensor | None:
-    return seen.info.get("estimate", {}).get("pose_covariance")

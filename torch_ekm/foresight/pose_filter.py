@@ -16,7 +16,7 @@ from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..contact.detector import ContactDetector
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..estimation.update import update
+from ..estimation.parameter_filter import update
 from ..exceptions import GraspError, NoContactError
 from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization

@@ -15,7 +15,8 @@ import torch
 from ..contact import ContactSet
 from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
-from ..control import ClosedLoop, LookAndMoveController
+from ..control import ClosedLoop, LookAndMoveController, PoseTarget
+from ..control.reach import out_of_reach
 from ..description import ContactPad, HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, EquilibriumError, GraspError, MissingExtraError
 from ..kinematics import ActuationMap, HandKinematics, LinkPoses
@@ -24,6 +25,7 @@ from ..rendering import make_scene, save_picture
 from ..simulation import PlantConfig, SimulatedHand, preset
 from ..simulation.grasp_planning.doctor import Cure, smallest_changes
 from ..simulation.grasp_planning.pinch import pinch_problem
+from ..simulation.grasp_planning.pinch_problem import PinchGeometry
 from ..simulation.grasp_planning.requirements import direction_unmet, unmet
 from ..simulation.parameters import PlantParameters
 from ..simulation.physics.links import x_axis_to
@@ -51,9 +53,9 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
     Args:
         hand: name or path, as :func:`load_hand` takes it.
         object: name or path, as :func:`load_object` takes it.
-        picture: file for a picture of the hand in the pinch, or the one that fails, with the pads'
-            directions (black) and the contact frames (red along the inward normal, tangents green and blue);
-            the object, which hides them, is left out.
+        picture: file for a picture of the hand in the pinch, with the pads' directions (black) and the
+            contact frames (red along the inward normal, tangents green and blue), and without the object,
+            which hides them; or of the pinch that fails, its object seen through.
 
     Returns:
         The checks in the order in which faults are best corrected. A fault ends in a row, never in an error.
@@ -215,7 +217,7 @@ def _cured(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
     yield _changes(cure)
     if picture is not None:
         with contextlib.suppress(EKMError, OSError):  # a row says so
-            _draw(hand, None, picture, cure.q)
+            _draw(hand, None, picture, obj, cure.failed)
 
 
 def _changes(cure: Cure) -> Check:
@@ -244,11 +246,13 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     remedy = "stiffer springs, another 'pinch_force', more friction, wider limits"
     try:
         plant = SimulatedHand(hand, obj)
-        plant.reset(0)
+        seen = plant.reset(0)
         model = KinematicModel(plant.hand, obj)
         controller = LookAndMoveController(model, plant.rotation_axis)
         loop = ClosedLoop(plant, controller)
         ends = [loop.reach(sign=sign) for sign in (-1, 1)]
+        turn = PoseTarget.turned(seen.state, plant.rotation_axis, degrees=math.degrees(_LITTLE_TURN))
+        few = out_of_reach(controller, seen, turn).partition(":")[0]
     except MissingExtraError:
         return
     except EKMError as error:
@@ -256,6 +260,8 @@ def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
         return
     found = ", ".join(f"{round(math.degrees(end.angle)):+d} deg ({end.end})" for end in ends)
     little = min(abs(end.angle) for end in ends) < _LITTLE_TURN
+    if few and little:
+        found, remedy = f"{found}; {few}", "motors that move pads along the object: these press it"
     yield Check("turn", "warning" if little else "ok", f"predicted: {found}", remedy if little else "")
 
 
@@ -362,13 +368,22 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
         yield Check("tendons in the pinch", "warning", f"slack: {', '.join(slack)}", remedy)
 
 
-def _draw(hand: HandDescription, lin: Linearization | None, path: Path, failed: Array | None = None) -> Path:
-    """The hand with a rod along each pad's direction and the axes of each contact frame."""
-    rest = torch.from_numpy(hand.spring_rest.clip(hand.joint_lower, hand.joint_upper))
+def _draw(
+    hand: HandDescription,
+    lin: Linearization | None,
+    path: Path,
+    obj: ObjectDescription | None = None,
+    failed: PinchGeometry | None = None,
+) -> Path:
+    """The hand with a rod along each pad's direction and the axes of each contact frame; or a pinch that
+    fails, its object seen through."""
+    q, place = torch.from_numpy(hand.spring_rest.clip(hand.joint_lower, hand.joint_upper)), (None, None)
+    if lin is not None:
+        q = lin.state.q
     if failed is not None:
-        rest = torch.from_numpy(failed)
-    q = rest if lin is None else lin.state.q
-    scene = make_scene(hand, None, q[None].numpy(), None, None, np.array(hand.gravity))
+        q, place = torch.from_numpy(failed.q[0]), (failed.position, failed.rotation)
+    scene = make_scene(hand, obj, q[None].numpy(), *place, np.array(hand.gravity))
+    scene = replace(scene, ghosts=0 if obj is None else len(obj.shapes))
     poses, rods = HandKinematics(hand)(q), []
     for pad in hand.pads:
         T = poses.of(pad.link).numpy()
@@ -379,12 +394,14 @@ def _draw(hand: HandDescription, lin: Linearization | None, path: Path, failed: 
         frames = contact_frames(lin.contacts.normal, plane).numpy()
         for point, frame in zip(lin.contacts.point.numpy(), frames, strict=True):
             rods += [(point, frame[:, k], 0.02, tuple(np.eye(3)[k].tolist())) for k in range(3)]
-    shapes, transforms = list(scene.shapes), [scene.transforms]
+    shapes, transforms = [], []
     for start, along, length, colour in rods:
         T = x_axis_to(along)[:, [1, 2, 0, 3]]  # a cylinder lies along z
         T[:3, 3] = start + length / 2 * along
         shapes.append((Shape("cylinder", (0.0008, length), np.eye(4)), colour))
         transforms.append(T[None, None])
+    shapes += scene.shapes  # what is seen through comes last
+    transforms.append(scene.transforms)
     return save_picture(replace(scene, shapes=shapes, transforms=np.concatenate(transforms, axis=1)), path)
 
 

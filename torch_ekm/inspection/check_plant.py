@@ -245,7 +245,7 @@ class _Checked:
         return Check("follow", "ok", f"a movement through 2 waypoints, {len(passed)} readings on the way")
 
     def _motion(self, i: int) -> tuple[Motion | None, Check | None, Array]:
-        """A motor goes as little as shows, and back; what speaks against it at once."""
+        """The smallest motion of a motor that shows, and back; what is wrong at once."""
         before = self._look()
         a0, q0 = self._mean()
         name, sign = f"motor '{self.hand.actuator_names[i]}'", self._sign(i, a0[i])

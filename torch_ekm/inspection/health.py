@@ -10,7 +10,7 @@ import numpy as np
 
 from .._noise import NOISE
 from ..description import HandDescription
-from ..estimation.update import update
+from ..estimation.parameter_filter import update
 from ..exceptions import StateError
 from ..kinematics import ServoModel
 from ..plant import PlantStatus, Trajectory

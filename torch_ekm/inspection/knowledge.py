@@ -1,4 +1,4 @@
-"""What a closed loop believes of a hand, since when, against the description."""
+"""The estimates of a closed loop of its hand, beside the description."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ NOT_IDENTIFIED = "not identified"
 _DEG = math.pi / 180
 
 
-class Belief(NamedTuple):
+class Estimated(NamedTuple):
     """One figure of a hand."""
 
     part: Part
@@ -55,22 +55,22 @@ def about(knowledge: HandKnowledge, file: Path, hand: str = "") -> dict[str, str
         against = f"that of '{named}'"
     except EKMError as error:
         against = str(error) if named else "the file names no hand: --hand"
-    told: dict[str, str | int] = {"written": _date(file), "motions": int(knowledge.figures.count)}
+    head: dict[str, str | int] = {"written": _date(file), "motions": int(knowledge.figures.count)}
     if previous(file).is_file():
-        told["before it"] = f"{previous(file)}, {_date(previous(file))}"
-    return {**told, "description": against}
+        head["before it"] = f"{previous(file)}, {_date(previous(file))}"
+    return {**head, "description": against}
 
 
 def _date(file: Path) -> str:
     return datetime.fromtimestamp(file.stat().st_mtime).isoformat(" ", "minutes")
 
 
-def beliefs(knowledge: HandKnowledge) -> list[Belief]:
+def estimates(knowledge: HandKnowledge) -> list[Estimated]:
     """All figures of a :class:`~torch_ekm.control.HandKnowledge`, part by part."""
     return [*_servo(knowledge), *_forces(knowledge), *_figures(knowledge), *_error(knowledge)]
 
 
-def _servo(knowledge: HandKnowledge) -> Iterator[Belief]:
+def _servo(knowledge: HandKnowledge) -> Iterator[Estimated]:
     servo = knowledge.servo
     if not isinstance(servo, ServoModel):
         return
@@ -79,16 +79,16 @@ def _servo(knowledge: HandKnowledge) -> Iterator[Belief]:
     ):
         for i, name in enumerate(servo.names):
             note = "stuck" * bool(servo.stuck[i])
-            yield Belief("servo", name, figure, float(values[i]) / _DEG, float(stds[i]) / _DEG, 0.0, note)
+            yield Estimated("servo", name, figure, float(values[i]) / _DEG, float(stds[i]) / _DEG, 0.0, note)
 
 
-def _forces(knowledge: HandKnowledge) -> Iterator[Belief]:
+def _forces(knowledge: HandKnowledge) -> Iterator[Estimated]:
     forces = knowledge.forces
     for i, (scale, std) in enumerate(zip(forces.scale.tolist(), forces.scale_std.tolist(), strict=True)):
-        yield Belief("forces", f"pad {i}", "of the model's answer", scale, std, 1.0, "")
+        yield Estimated("forces", f"pad {i}", "of the model's answer", scale, std, 1.0, "")
 
 
-def _figures(knowledge: HandKnowledge) -> Iterator[Belief]:
+def _figures(knowledge: HandKnowledge) -> Iterator[Estimated]:
     learned = knowledge.figures
     if not isinstance(learned, HandFigures):
         return
@@ -96,12 +96,12 @@ def _figures(knowledge: HandKnowledge) -> Iterator[Belief]:
     for one in learned.figures:
         unit, figure = (_DEG, "width [deg]") if one.is_width else (1.0, "of its description")
         note = changed.get(one.name, "" if one.identified else NOT_IDENTIFIED)
-        yield Belief(
+        yield Estimated(
             "figures", one.name, figure, one.factor / unit, one.std / unit, one.described / unit, note
         )
 
 
-def _error(knowledge: HandKnowledge) -> Iterator[Belief]:
+def _error(knowledge: HandKnowledge) -> Iterator[Estimated]:
     error = knowledge.error
     for name, share in (("along", error.along), ("across", error.across)):
-        yield Belief("error", name, "share of a motion", share, None, None, "")
+        yield Estimated("error", name, "share of a motion", share, None, None, "")

@@ -19,7 +19,7 @@ from ..kinematics import ActuationMap, GraspState
 from ..kinematics.se3 import log as rotation_vector
 from ..model import KinematicModel
 from ..plant import Observation, PlantStatus, Trajectory, TrialLog
-from ..rendering import Scene, Told, make_scene
+from ..rendering import Captions, Scene, make_scene
 from ..rendering.visuals import visuals
 from ..rendering.web import pad_forces
 from ..simulation import SimulatedHand
@@ -35,7 +35,7 @@ class View:
 
     scene: Scene
     """Its frames are played one after another."""
-    told: Told
+    captions: Captions
     """Title, and what the page says of each frame."""
     header: tuple[str, ...] = ()
     rows: tuple[tuple[str, ...], ...] = ()
@@ -89,7 +89,7 @@ def view_hand(hand: HandDescription) -> View:
     for k, posture in enumerate(postures[1:]):
         i = k // len(ways)
         lines.append(f"motor {hand.actuator_names[i]} at {math.degrees(posture[i]):.0f} deg")
-    return View(scene, Told(hand.name, tuple(lines)), notes=tuple(visuals(hand.urdf).problems))
+    return View(scene, Captions(hand.name, tuple(lines)), notes=tuple(visuals(hand.urdf).problems))
 
 
 def _grasp(plant: SimulatedHand, seen: Observation) -> View:
@@ -114,13 +114,13 @@ def _grasp(plant: SimulatedHand, seen: Observation) -> View:
         "forces [N]",
     )
     states = [_truth(one) for one in shown]
-    told = Told(
+    captions = Captions(
         f"{hand.name} holds {plant.object.name}",
         tuple(lines),
         _turned(states, axis),
         forces=_forces_on(hand, states, [one.fingertip_force for one in shown]),
     )
-    return View(_scene(plant, states), told, header, tuple(rows))
+    return View(_scene(plant, states), captions, header, tuple(rows))
 
 
 def _reach(plant: SimulatedHand) -> View:
@@ -131,7 +131,7 @@ def _reach(plant: SimulatedHand) -> View:
     there = [_along(reach) for reach in (forth, back)]
     shown = [*there[0], *reversed(there[0][:-1]), *there[1][1:], *reversed(there[1][:-1])]
     states = [one.state for one in shown]
-    told = Told(
+    captions = Captions(
         f"{plant.hand.name} turns {plant.object.name}: the plan both ways, with two standard deviations",
         tuple(one.line for one in shown),
         _turned(states, plant.rotation_axis),
@@ -140,7 +140,7 @@ def _reach(plant: SimulatedHand) -> View:
     )
     rows = tuple(row for name, end in (("back", back), ("forth", forth)) for row in _way(name, end))
     header = ("direction", "angle [deg]", "off the axis [deg]", "ends by")
-    return View(_scene(plant, states), told, header, rows)
+    return View(_scene(plant, states), captions, header, rows)
 
 
 class _Waypoint(NamedTuple):
@@ -213,14 +213,14 @@ def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool 
     header = ("time [s]", "object", "turned [deg]", "wrong by [deg]", "commanded [deg]", "events")
     rows = tuple(_moments(trajectory, hand))
     target = trajectory.about.get("outcome", {}).get("angle_deg")
-    told = Told(
+    captions = Captions(
         f"{hand.name} holds {obj.name}: {log.stem}",
         tuple(f"motion {k}, {row[0]} s, {row[1]}: {row[4]}" for k, row in enumerate(rows)),
         np.array([float(row[2]) for row in rows]),
         target=abs(target) if isinstance(target, float) else None,
         forces=_forces_on(hand, states, [seen.fingertip_force for seen in trajectory.observations]),
     )
-    return View(scene, told, header, rows)
+    return View(scene, captions, header, rows)
 
 
 def _moments(trajectory: Trajectory, hand: HandDescription) -> list[tuple[str, ...]]:

@@ -213,7 +213,7 @@ def _latched(ext: Any) -> bool:
 def _written(reader: Any, topics: set[str]) -> Iterator[tuple[str, str, int, bytes]]:
     """Topic, type, time of the log [ns] and bytes, in the order of writing: only there a clock goes back.
 
-    Where the storage does not tell, in the order of time.
+    Where the storage has no order, in that of time.
     """
     for bag in reader.readers:
         storage = getattr(bag, "storage", None)

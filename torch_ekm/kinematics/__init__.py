@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from .actuation import ActuationMap
+from .equilibrium import ActuationMap
 from .grasp_state import GraspState
-from .hand_kinematics import HandKinematics
-from .link_poses import LinkPoses
-from .play import Play
-from .servo_model import ServoModel
+from .hand_kinematics import HandKinematics, LinkPoses
+from .servo_model import Play, ServoModel
 
 __all__ = ["ActuationMap", "GraspState", "HandKinematics", "LinkPoses", "Play", "ServoModel"]

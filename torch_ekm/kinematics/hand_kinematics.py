@@ -1,7 +1,8 @@
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -13,8 +14,50 @@ from .._extras import require
 from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError, UnknownNameError
 from ..typing import Array, Bool, Float, Tensor
-from .link_poses import LinkPoses
 from .se3 import exp
+
+
+@dataclass(frozen=True)
+class LinkPoses:
+    """``T_hand_link`` of every link, in the order of ``link_names``."""
+
+    transforms: Float[Tensor, "*batch n_link 4 4"]
+    """Homogeneous transforms [m], link frame to hand frame."""
+    link_names: tuple[str, ...]
+
+    def of(self, name: str) -> Float[Tensor, "*batch 4 4"]:
+        """Pose of one link.
+
+        Raises:
+            UnknownNameError: there is no such link; the message lists all.
+        """
+        if name not in self.link_names:
+            raise UnknownNameError("link", name, self.link_names)
+        return self.transforms[..., self.link_names.index(name), :, :]
+
+
+@runtime_checkable
+class Kinematics(Protocol):
+    """Forward kinematics of a hand in the hand frame: :class:`HandKinematics` or one's own."""
+
+    @property
+    def link_names(self) -> tuple[str, ...]: ...
+
+    @property
+    def upstream(self) -> Tensor:
+        """``[link, joint]``: the joint moves the link, bool ``(n_link, n_q)``."""
+        ...
+
+    @property
+    def dtype(self) -> torch.dtype: ...
+
+    def __call__(self, q: Tensor, /) -> LinkPoses:
+        """Poses of all links at joint angles [rad]."""
+        ...
+
+    def joint_axes(self, poses: LinkPoses, /) -> tuple[Tensor, Tensor]:
+        """Unit axis of every joint and a point on it [m], ``(*batch, n_q, 3)`` each."""
+        ...
 
 
 class HandKinematics(nn.Module):

@@ -1,11 +1,15 @@
+"""Tensors of any input, and the null space of a matrix."""
+
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import torch
 
+from .._arrays import namespace
 from ..exceptions import ParameterError
-from ..typing import Tensor
+from ..typing import AnyArray, Float, Tensor
 
 
 def as_tensors(**values: object) -> list[Tensor]:
@@ -31,3 +35,14 @@ def as_tensors(**values: object) -> list[Tensor]:
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         valid = f"numbers, in a tensor, an array or nested lists ({error})"
         raise ParameterError(", ".join(values), tuple(values.values()), valid) from None
+
+
+def null_space(rows: Float[AnyArray, "m n"]) -> Float[Any, "n n_free"]:
+    """Orthonormal basis N of ``rows N = 0`` (SVD); all of space where there are no rows.
+
+    Args:
+        rows: constraints whose entries compare with 1: angles, or lengths divided by a typical one. Singular
+            values up to 1e-9 count as 0.
+    """
+    _, sigma, Vh = namespace(rows).linalg.svd(rows, full_matrices=True)
+    return Vh[int((sigma > 1e-9).sum()) :].mT

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from .._arrays import like, namespace
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from ..contact.forces.balance import BalanceEquations, ForceSolution, ForceStatus
-from ..contact.forces.friction import friction_cones, margins
+from ..contact.forces.problem import BalanceEquations, ForceSolution, ForceStatus, friction_cones, margins
 from ..contact.forces.solve import contact_forces
 from ..description.hand import HandDescription
 from ..typing import AnyArray, Array, Bool, Float, Tensor
@@ -26,7 +25,7 @@ from .reduction import Reduction
 
 Mask = NDArray[np.bool_]
 STOP_TOLERANCE = math.radians(0.1)
-"""How near to a limit a joint counts as touching its stop [rad]. Joint angles alone cannot tell how much
+"""How near to a limit a joint counts as touching its stop [rad]. Joint angles alone do not determine how much
 torque a stop takes from the contact forces; fingertip sensors can."""
 _STOP_TORQUE = 0.01  # [N m] above which a stop holds its joint; below, the joint may leave
 

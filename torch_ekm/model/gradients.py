@@ -20,9 +20,7 @@ import torch
 from .._checks import check_kind
 from .._extras import require
 from ..contact.contact_set import VARYING, ContactSet
-from ..contact.forces.balance import BalanceEquations, ForceSolution
-from ..contact.forces.options import ForceOptions
-from ..contact.forces.problem import force_cost, force_problem
+from ..contact.forces.problem import BalanceEquations, ForceOptions, ForceSolution, force_cost, force_problem
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import A_STATE, GraspState
 from ..typing import Float, Tensor

@@ -16,8 +16,7 @@ from .._arrays import namespace, norm
 from .._noise import NOISE
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from ..contact.forces.balance import ForceStatus
-from ..contact.forces.options import ForceOptions
+from ..contact.forces.problem import ForceOptions, ForceStatus
 from ..exceptions import ShapeError
 from ..typing import AnyArray, Array, Float, Tensor
 

@@ -16,11 +16,9 @@ from ..contact.detector import ContactDetector
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.grasp_state import A_STATE, GraspState
-from ..kinematics.hand_kinematics import HandKinematics
-from ..kinematics.link_poses import Kinematics, LinkPoses
+from ..kinematics.hand_kinematics import HandKinematics, Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
 from .arms import Arms, arms_at, bends, over_posture
-from .checks import at_pads, check_contacts, check_described, check_inertia, check_state
 from .force_balance import ForceBalance
 from .gradients import following, only_if_asked
 from .grasp_forces import ExpectedForces, GraspForces
@@ -28,11 +26,15 @@ from .linearization import FollowedFigures, Linearization
 from .motion_equations import MotionEquations
 from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .options import ModelOptions
-from .reduction import Reduction
-from .sensitivity import sensitivities
-from .stiffness.geometric import geometric_stiffness, precedence
-from .stiffness.potential import gravity_gradient, gravity_hessian, spring_torque
-from .validity import find_doubts
+from .reduction import Reduction, sensitivities
+from .stiffness import (
+    geometric_stiffness,
+    gravity_gradient,
+    gravity_hessian,
+    precedence,
+    spring_torque,
+)
+from .validity import at_pads, check_contacts, check_described, check_inertia, check_state, find_doubts
 
 TOUCHING = 0.2e-3
 """Gap of a link that counts as touching [m]."""
@@ -77,6 +79,8 @@ class KinematicModel(nn.Module):
     """Of the object, in its own frame [m]."""
     figures: FollowedFigures | None = None
     """What J_m follows in place of the description, see :meth:`with_figures`."""
+    surface: float = 0.0
+    """How much farther out the object's surface is than described [m]; a loop that learns sets it."""
     plane: Float[Tensor, " 3"] | None
     """Normal of a planar hand's plane; None: a spatial hand."""
     precedes: Bool[Tensor, "n_q n_q"]
@@ -101,6 +105,7 @@ class KinematicModel(nn.Module):
         if detector is None:
             detector = ContactDetector(hand, obj, self.options.contact_margin, kinematics=self.kinematics)
         self.detector = detector
+        self._grown: tuple[float, ContactDetector] | None = None
         self.link_names = tuple(self.kinematics.link_names)
         self.reduction = Reduction(hand, self.options, dtype)
         self.balance = ForceBalance(hand, self.options, self.reduction)
@@ -126,6 +131,15 @@ class KinematicModel(nn.Module):
         )  # fmt: skip
         object.__setattr__(made, "figures", figures)  # they belong to the hand, not to the model's state
         return made
+
+    @property
+    def touch_detector(self) -> Detector:
+        """The detector, of an object whose surface is ``surface`` farther out."""
+        if not self.surface or not isinstance(self.detector, ContactDetector):
+            return self.detector
+        if self._grown is None or self._grown[0] != self.surface:
+            self._grown = self.surface, self.detector.grown(self.surface)
+        return self._grown[1]
 
     def followed(self, lin: Linearization) -> Linearization:
         """The same state with J_m of the present figures."""
@@ -174,11 +188,11 @@ class KinematicModel(nn.Module):
     def _detect(
         self, state: GraspState, poses: LinkPoses | None, fingertip_force: Tensor | None
     ) -> ContactSet:
-        detector, place = self.detector, (state.position, state.rotation)
+        detector, place = self.touch_detector, (state.position, state.rotation)
         with torch.no_grad():
             if isinstance(detector, ContactDetector):
                 at = state.q if poses is None else poses
-                contacts = detector(at, *place, self._pressing(fingertip_force))
+                contacts = detector(at, *place, self.pressing(fingertip_force))
             else:
                 contacts = detector(state.q, *place)
         if contacts.n_c == 0:
@@ -187,7 +201,7 @@ class KinematicModel(nn.Module):
             return contacts
         return following(contacts, lambda at: self.contacts(at, fingertip_force), state)
 
-    def _pressing(self, fingertip_force: Tensor | None) -> tuple[str, ...]:
+    def pressing(self, fingertip_force: Tensor | None) -> tuple[str, ...]:
         """Pads that measure a force."""
         if fingertip_force is None or fingertip_force.shape != (len(self.hand.pads),):
             return ()
@@ -203,12 +217,12 @@ class KinematicModel(nn.Module):
         Raises:
             NoContactError: nothing touches the object.
         """
-        contacts = self.contacts(state, fingertip_force)
-        if not isinstance(self.detector, ContactDetector):
+        contacts, detector = self.contacts(state, fingertip_force), self.touch_detector
+        if not isinstance(detector, ContactDetector):
             return contacts
-        margin = max(self.detector.margin, TOUCHING)
-        pressing = self._pressing(fingertip_force)
-        near = self.detector.near(state.q, state.position, state.rotation, margin, pressing)
+        margin = max(detector.margin, TOUCHING)
+        pressing = self.pressing(fingertip_force)
+        near = detector.near(state.q, state.position, state.rotation, margin, pressing)
         pads = len(contacts.finger)  # they come first, in the same order
         links = [i for i in range(pads, near.n_c) if float(near.gap[i]) < TOUCHING]
         return near.select([*range(pads), *links])
@@ -279,7 +293,7 @@ class KinematicModel(nn.Module):
         previous: Linearization | None = None,
         on_unstable: str | None = None,
     ) -> Linearization:
-        """Contacts, forces, ``J_m``, the force sensitivities and what speaks against them, at a state.
+        """Contacts, forces, ``J_m``, the force sensitivities and their doubts, at a state.
 
         Differentiable: with respect to the state, and to the buffers ``spring_stiffness``, ``spring_rest``,
         ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks

@@ -62,7 +62,7 @@ class Linearization:
     described_normal: Float[Tensor, "n_c n_a"] | None = None
     """d f_n/da of the model, where what was measured corrects it; None: it is that."""
     doubts: tuple[Doubt, ...] = ()
-    """What speaks against this linearization, worst first."""
+    """Why this linearization may be wrong, worst first."""
 
     @property
     def status(self) -> ModelStatus:

@@ -9,8 +9,7 @@ from ..exceptions import ParameterError
 from ..kinematics.se3 import exp, log
 from ..typing import Float, Tensor
 from .observation import Observation, PlantStatus
-from .plant import Plant
-from .wrapper import PlantWrapper
+from .plant import Plant, PlantWrapper
 
 _OUTLIER = 4.0  # times the median distance from the median: 6 standard deviations of a Gaussian in space
 

@@ -15,11 +15,8 @@ from ..description import HandDescription
 from ..exceptions import CommandRefusedError, ParameterError, PlantInUseError
 from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
-from .observation import Observation
-from .path import Path
-from .plant import Plant, can_follow
-from .readable import readable
-from .wrapper import PlantWrapper
+from .observation import Observation, readable
+from .plant import Path, Plant, PlantWrapper, can_follow
 
 _DEG = math.pi / 180
 _ROUNDED = 1e-9  # [rad] of a limit: sums of floats

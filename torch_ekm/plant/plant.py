@@ -1,13 +1,69 @@
-"""What a control loop drives: the plant contract."""
+"""A hand as a controller sees it: what it must do, movements of its motors, and what is put around it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, TypeGuard, runtime_checkable
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
+import torch
+
+from .._checks import check_finite, check_positive
+from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .observation import Observation
-from .path import Path
+
+_LEAST = 0.01  # [s] of a piece: no bus takes goals faster
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """``a(t) = a_0 + w_k + (t - t_k) / (t_k+1 - t_k) (w_k+1 - w_k)``: straight from one waypoint to the next.
+
+    Raises:
+        ShapeError: waypoints are not ``(n, n_a)`` with n of 1 or more, or times not ``(n,)``.
+        NonFiniteError: an entry is NaN or infinite.
+        ParameterError: times do not increase from above 0 on.
+    """
+
+    waypoints: Float[Tensor, "n n_a"]
+    """Set-points w relative to the encoders before the movement [rad]; the last is its end."""
+    times: Float[Tensor, " n"]
+    """When each is passed, after the start [s]. A plant whose servos are slower takes longer."""
+
+    def __post_init__(self) -> None:
+        for name in ("waypoints", "times"):
+            value = torch.as_tensor(getattr(self, name)).detach().to("cpu", torch.float64)
+            check_finite(name, value)
+            object.__setattr__(self, name, value)
+        if self.waypoints.ndim != 2 or not len(self.waypoints):
+            raise ShapeError("waypoints", "(n, n_a), n of 1 or more", tuple(self.waypoints.shape))
+        if self.times.shape != self.waypoints.shape[:1]:
+            raise ShapeError("times", f"({len(self.waypoints)},)", tuple(self.times.shape))
+        if not bool((self.durations > 0).all()):
+            raise ParameterError("times", self.times.tolist(), "increasing, the first above 0 [s]")
+
+    @classmethod
+    def through(cls, waypoints: Float[Tensor, "n n_a"], speed: float) -> Path:
+        """The motor that goes farthest in a piece goes at ``speed`` [rad/s]; no piece is below 0.01 s.
+
+        Raises:
+            ShapeError, NonFiniteError, ParameterError: see :class:`Path`, or the speed is not positive.
+        """
+        path = cls(waypoints, torch.arange(1.0, len(waypoints) + 1))
+        seconds = path.pieces.abs().amax(1) / check_positive("speed", speed)
+        object.__setattr__(path, "times", seconds.clamp(min=_LEAST).cumsum(0))  # looked at already
+        return path
+
+    @property
+    def pieces(self) -> Float[Tensor, "n n_a"]:
+        """From waypoint to waypoint, the first from where the motors are [rad]."""
+        return self.waypoints.diff(dim=0, prepend=torch.zeros_like(self.waypoints[:1]))
+
+    @property
+    def durations(self) -> Float[Tensor, " n"]:
+        """Of the pieces [s]."""
+        return self.times.diff(prepend=self.times.new_zeros(1))
 
 
 @runtime_checkable
@@ -49,3 +105,59 @@ class FollowingPlant(Plant, Protocol):
 def can_follow(plant: Plant) -> TypeGuard[FollowingPlant]:
     """Whether a plant has :meth:`FollowingPlant.follow`; a wrapper has it where what it wraps has."""
     return hasattr(plant, "follow")
+
+
+class PlantWrapper:
+    """Passes everything on to ``plant``; implements :class:`Plant`.
+
+    A subclass overrides :meth:`observation` to change what is seen, :meth:`command` to change what is
+    commanded, :meth:`reset` to begin again. What a plant offers beyond the contract (``hand``, ``object``,
+    ``rotation_axis`` of a simulated hand) is found on the wrapper, too. So is ``follow``, unless a subclass
+    overrides :meth:`command` and not :meth:`_followed`: no motion passes it by.
+    """
+
+    def __init__(self, plant: Plant) -> None:
+        self.plant = plant
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name in ("plant", "follow"):  # not yet set: no endless search
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self.plant, name)
+
+    def reset(self, seed: int) -> Observation:
+        """Grasp the object again; the observation after it, as :meth:`observation` changes it."""
+        return self.observation(self.plant.reset(seed))
+
+    def observe(self) -> Observation:
+        """Read the sensors, as :meth:`observation` changes the reading."""
+        return self.observation(self.plant.observe())
+
+    def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
+        """Move the actuators by ``delta_a`` [rad], wait, read the sensors."""
+        return self.observation(self.plant.command(delta_a))
+
+    @property
+    def follow(self) -> Callable[[Path, Callable[[Observation], bool]], Observation]:
+        """See :class:`FollowingPlant`; there is none where ``plant`` has none."""
+        own = type(self)
+        passed_by = own.command is not PlantWrapper.command and own._followed is PlantWrapper._followed
+        if passed_by or not can_follow(self.plant):
+            raise AttributeError(f"{own.__name__} has no attribute 'follow'")
+        return self._followed
+
+    def _followed(self, path: Path, watch: Callable[[Observation], bool]) -> Observation:
+        """``follow``, with all readings as :meth:`passing` and :meth:`observation` change them."""
+        assert can_follow(self.plant)
+        return self.observation(self.plant.follow(path, lambda seen: watch(self.passing(seen))))
+
+    def passing(self, seen: Observation) -> Observation:
+        """What is passed on of a reading on the way, which nothing may delay."""
+        return self.observation(seen)
+
+    def observation(self, seen: Observation) -> Observation:
+        """What is passed on of what ``plant`` has seen."""
+        return seen
+
+    def close(self) -> None:
+        """Close the wrapped plant: its devices, windows and files."""
+        self.plant.close()

@@ -12,9 +12,7 @@ from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .gate import Gate
 from .observation import Observation
-from .path import Path
-from .plant import Plant
-from .wrapper import PlantWrapper
+from .plant import Path, Plant, PlantWrapper
 
 
 class ServoInverse(PlantWrapper):
@@ -47,9 +45,10 @@ class ServoInverse(PlantWrapper):
         super().__init__(self.gate)
         self.servo = ServoModel(hand.actuator_names) if servo is None else servo
         self._range = [torch.from_numpy(edge) for edge in (hand.actuator_lower, hand.actuator_upper)]
-        self._start = self.sent = torch.zeros(len(self.servo.names), dtype=torch.float64)
+        self._start = torch.zeros(len(self.servo.names), dtype=torch.float64)
+        self.sent = self._start[None]
         """v of the last motion [rad]; of a path, its last waypoint."""
-        self._told = torch.ones(len(self.servo.names), dtype=torch.bool)  # motors that it tells something of
+        self._known = torch.ones(len(self.servo.names), dtype=torch.bool)  # motors that it has figures of
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
         """Move the encoders by ``delta_a`` [rad], wait, read the sensors, learn of the servos.
@@ -70,7 +69,7 @@ class ServoInverse(PlantWrapper):
         check_shape("delta_a", delta_a, (len(names),), f"in order: {', '.join(names)}")
         check_finite("delta_a", delta_a)
         v, _ = self._inverse(delta_a[None], start)
-        self._start, self.sent, self._told = start.a, v[0], torch.ones_like(self._told)
+        self._start, self.sent, self._known = start.a, v, torch.ones_like(self._known)
         return self.gate.command(v[0], start, by)
 
     def follow(  # type: ignore[override]
@@ -101,11 +100,11 @@ class ServoInverse(PlantWrapper):
         seconds = v.diff(dim=0, prepend=torch.zeros_like(v[:1])).abs().amax(1) / self.gate.speed
         sent = Path(v, torch.maximum(path.durations, seconds).cumsum(0))
         onward = last * waypoints[-1] > self.servo.resolution  # else it ends on its way back
-        self._start, self.sent, self._told = start.a, v[-1], onward | (last == 0)
+        self._start, self.sent, self._known = start.a, v, onward | (last == 0)
 
         def look(seen: Observation) -> bool:
             goes_on = watch(seen)
-            self._told = self._told & goes_on
+            self._known = self._known & goes_on
             return goes_on
 
         return self.gate.follow(sent, look, start, by)
@@ -123,8 +122,8 @@ class ServoInverse(PlantWrapper):
 
     def learn(self, after: Observation) -> None:
         """An accepted reading after the last motion."""
-        start, v = self._start, self.sent
-        self.servo.update(v, after.a - start, self._told & self._free(start, v, after.a))
+        start, v = self._start, self.sent[-1]
+        self.servo.update(v, after.a - start, self._known & self._free(start, v, after.a))
 
     def _within_range(self, a: Tensor, v: Tensor) -> Tensor:
         """v, cut where ``a + v`` would lie outside; it is never turned round."""

@@ -13,8 +13,7 @@ from .._files import WriterLock, make_folder, told_as_damage, told_as_output_err
 from .._versions import versions_of
 from .._warnings import warn
 from ..exceptions import DescriptionError, ParameterError, StateError
-from .trajectory import Trajectory, plain
-from .trial_file import read_trial
+from .trajectory import Trajectory, plain, read_trial
 
 DAMAGED = ".damaged"
 _NAME = re.compile(r"trial_(\d{6,})\.h5")

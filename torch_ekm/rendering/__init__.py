@@ -5,12 +5,12 @@ from __future__ import annotations
 from .drawing import Picture
 from .image import save_picture
 from .scene import Scene, make_scene
-from .web import Told, save_animation
+from .web import Captions, save_animation
 
 __all__ = [
+    "Captions",
     "Picture",
     "Scene",
-    "Told",
     "make_scene",
     "save_animation",
     "save_picture",

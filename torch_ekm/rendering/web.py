@@ -23,7 +23,7 @@ _PAGE = Path(__file__).with_name("page.html")
 
 
 @dataclass(frozen=True)
-class Told:
+class Captions:
     """What a page says beside the picture: of ``n`` frames."""
 
     title: str = ""
@@ -39,34 +39,36 @@ class Told:
     """``(n, n_pads, 6)``: where a pad presses [m], and with what force [N], hand frame; NaN: not known."""
 
 
-def save_animation(scene: Scene, path: Path, told: Told | None = None, *, seconds: float = 0.25) -> Path:
+def save_animation(
+    scene: Scene, path: Path, captions: Captions | None = None, *, seconds: float = 0.25
+) -> Path:
     """Write the frames as one stand-alone HTML page: play, step, turn, zoom. WebGL 2 draws it.
 
     Args:
-        told: title, and what is known of each frame.
+        captions: title, and what is shown with each frame.
         seconds: from frame to frame, between which poses are interpolated.
 
     Raises:
-        ShapeError: ``told`` is of another number of frames.
+        ShapeError: ``captions`` is of another number of frames.
         OutputError: ``path`` cannot be written.
     """
-    told = Told() if told is None else told
+    captions = Captions() if captions is None else captions
     n = len(scene.transforms)
     for name in ("lines", "turned", "std", "forces"):
-        value = getattr(told, name)
+        value = getattr(captions, name)
         if value is not None and len(value) not in ({0, n} if name == "lines" else {n}):
             raise ShapeError(name, f"({n}, ...)", (len(value),))
     eye, focus, up = (part.tolist() for part in scene.camera)
     data = {
-        "title": told.title,
-        "lines": told.lines,
+        "title": captions.title,
+        "lines": captions.lines,
         "frames": n,
         "seconds": seconds,
         "shapes": [_shape(scene, i, *one) for i, one in enumerate(scene.shapes)],
         "poses": _packed(scene.transforms[:, :, :3]),
         "camera": {"eye": eye, "focus": focus, "up": up},
-        "curve": _curve(told),
-        "arrows": None if told.forces is None else _packed(np.nan_to_num(told.forces)),
+        "curve": _curve(captions),
+        "arrows": None if captions.forces is None else _packed(np.nan_to_num(captions.forces)),
     }
     # of a text that ends the script nothing is left that a browser takes for a tag
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
@@ -75,7 +77,7 @@ def save_animation(scene: Scene, path: Path, told: Told | None = None, *, second
 
 
 def pad_forces(hand: HandDescription, q: Array, normal: Array) -> Array:
-    """The middle of each pad's surface and the force with which it presses there, for :class:`Told`.
+    """The middle of each pad's surface and the force with which it presses there, for :class:`Captions`.
 
     Args:
         q: ``(n, n_q)`` [rad].
@@ -102,14 +104,14 @@ def _shape(scene: Scene, i: int, shape: Any, colour: Colour) -> dict[str, Any]:
     return {**look, "kind": shape.kind, "size": list(shape.size)}
 
 
-def _curve(told: Told) -> dict[str, Any] | None:
-    if told.turned is None:
+def _curve(captions: Captions) -> dict[str, Any] | None:
+    if captions.turned is None:
         return None
-    target = None if told.target is None else float(told.target)
-    curve: dict[str, Any] = {"label": "turned [deg]", "values": told.turned.tolist(), "target": target}
-    if told.std is not None:
-        curve["low"] = (told.turned - 2 * told.std).tolist()
-        curve["high"] = (told.turned + 2 * told.std).tolist()
+    target = None if captions.target is None else float(captions.target)
+    curve: dict[str, Any] = {"label": "turned [deg]", "values": captions.turned.tolist(), "target": target}
+    if captions.std is not None:
+        curve["low"] = (captions.turned - 2 * captions.std).tolist()
+        curve["high"] = (captions.turned + 2 * captions.std).tolist()
     return curve
 
 

@@ -70,7 +70,7 @@ def default_learner(
         SparseOnlineGP(d, m, parts=wanders, **late[2]),
         SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=fades, **{**late[3], "capacity": few}),
     ]
-    # a line through two samples extrapolates to anything, so it is believed later
+    # a line through two samples extrapolates to anything, so its weight rises later
     doubts = (0.0, 0.0, 0.0, 2.0)
     return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), doubts=doubts, **options)
 

@@ -1,4 +1,4 @@
-"""Online Bayesian mixture around any learners: what to believe of them, and what noise carries over."""
+"""Online Bayesian mixture around any learners: their weights, and noise that returns in the next sample."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class MixtureResidual(MixtureQueries):
         members_of = torch.nn.functional.one_hot(torch.tensor(owner), len(members))
         self.owner = nn.Buffer(members_of.to(self._like), persistent=False)
         """1 where an expert takes its mean from that learner, ``(experts, learners)``."""
-        # what is not believed of a share of 1 is split over the others
+        # what is missing of a share of 1 is split over the others
         prior = torch.where(self.shares == 1.0, _PRIOR, (1 - _PRIOR) / (len(_SHARES) - 1)).log()
         self.prior = nn.Buffer(prior.to(self._like), persistent=False)
         wide = (*self.batch_shape, self.out_features, len(owner))
@@ -281,7 +281,7 @@ class MixtureResidual(MixtureQueries):
 
 
 def _bounded(z: Tensor) -> Tensor:
-    """Squares stay finite; what is farther off says nothing more."""
+    """Squares stay finite: larger errors add nothing."""
     return z.nan_to_num(E.FARTHEST).clamp(-E.FARTHEST, E.FARTHEST)
 
 

@@ -170,7 +170,7 @@ class MixtureQueries(ResidualLearner):
         return (self.gain * means).sum(-1) + self.offset
 
     def _wide(self, variances: Float[Tensor, "*any out learners"]) -> Tensor:
-        """A learner whose variance is not finite knows as little as the spread of y."""
+        """A variance that is not finite is replaced by that of y."""
         return variances.where(variances.isfinite(), self.largest.square().unsqueeze(-1).to(variances))
 
     def _means(self, means: Float[Tensor, "*any out learners"]) -> Float[Tensor, "*any out experts"]:

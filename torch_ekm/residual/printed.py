@@ -1,4 +1,4 @@
-"""What a learner knows, on one screen."""
+"""The state of a learner, on one screen."""
 
 from __future__ import annotations
 

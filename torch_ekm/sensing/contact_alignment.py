@@ -10,7 +10,7 @@ from .._warnings import warn
 from ..contact.contact_kinematics import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
-from ..estimation.update import update
+from ..estimation.parameter_filter import update
 from ..kinematics import HandKinematics
 from ..plant import Observation, Plant, PlantWrapper
 from ..typing import Float, Tensor
@@ -40,7 +40,7 @@ class ContactAligned(PlantWrapper):
     A pad that measures force and stays 0.7 to 10 mm away, since the joint that is to close the gap stands at
     its stop, says that the sensor of another one is wrong, such as one that died after its calibration: the
     one, known to 30 deg from then on, without which all gaps and encoders are likeliest. A warning names it;
-    the next grasp believes it again.
+    the next grasp uses it again.
 
     P is ``info["estimate"]["joint_covariance"]`` [rad^2] where the plant states it, else 0.5 deg for joints
     with a Hall sensor and 10 deg for others. Solved by Gauss-Newton, at every observation, within the joints'

@@ -25,7 +25,7 @@ class HallEstimate(NamedTuple):
     q: Float[Tensor, "*batch n_channels"]
     """Angles [rad]; of a saturated channel the middle of the range that it cannot resolve."""
     std: Float[Tensor, "*batch n_channels"]
-    """Standard deviations [rad]; of a channel that says nothing, that of a uniform spread over its sweep."""
+    """Standard deviations [rad]; of an invalid channel that of a uniform spread over its sweep."""
     valid: Bool[Tensor, "*batch n_channels"]
     """False where the channel is saturated or was stuck when calibrated."""
     within: Float[Tensor, "2 *batch n_channels"]
@@ -142,7 +142,7 @@ class HallCalibration:
         return cls([_fit(name, readings[:, k], angles[:, k]) for k, name in enumerate(joints)])
 
     def estimate(self, readings: Float[Tensor, "*batch n_channels"]) -> HallEstimate:
-        """Angles, their deviations, and which of them to believe.
+        """Angles, their deviations, and which of them are valid.
 
         Raises:
             ShapeError: the last dimension is not the number of channels.

@@ -7,7 +7,7 @@ import torch
 from .._checks import check_finite
 from .._noise import NOISE
 from ..description import HandDescription
-from ..estimation.update import update
+from ..estimation.parameter_filter import update
 from ..exceptions import JointMismatchError, ShapeError
 from ..typing import Float, Tensor
 from .hall_calibration import HallCalibration, HallEstimate

@@ -27,7 +27,7 @@ class PlantConfig:
     """Pad that opposes the others; None: the one whose name begins with "thumb", else the one that faces the
     others best while the hand closes."""
     fingers: tuple[str, ...] | None = None
-    """Opposing pads; None: index and middle where there are such, else all others."""
+    """Opposing pads; None: index and middle where there are both, else all others."""
     along: tuple[float, float, float] | None = None
     """Direction in the hand of the object's long axis, within 5 deg, about which a pinch can turn it. None:
     the normal of a planar hand, else the axis about which most pads' last joints turn, or that of the hand

@@ -128,16 +128,16 @@ class InHandRotation(gymnasium.Env):
         self._target = float((options or {}).get("angle", self.np_random.uniform(*self.angles)))
         self._start = self.plant.reset(int(self.np_random.integers(2**31)))
         self._axis = self.plant.rotation_axis
-        return self._told(self._start)[:2]
+        return self._observed(self._start)[:2]
 
     def step(self, action: NDArray[Any]) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Move the actuators and let the hand settle."""
         delta = np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) * self.step_limit
         observation = self.plant.command(torch.from_numpy(delta))
-        told, info, to_go, off = self._told(observation)
+        observed, info, to_go, off = self._observed(observation)
         lost, reached = observation.status is PlantStatus.LOST, info["is_success"]
         reward = -(abs(to_go) + _OFF_AXIS * off) / (10 * _DEG) + reached - _LOST * lost
-        return told, float(reward), lost or reached, False, info
+        return observed, float(reward), lost or reached, False, info
 
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """A picture ``(height, width, 3)`` of the true state, or None without a render mode."""
@@ -157,7 +157,7 @@ class InHandRotation(gymnasium.Env):
             self._picture.close()
             self._picture = None
 
-    def _told(self, observation: Observation) -> tuple[Array, dict[str, Any], float, float]:
+    def _observed(self, observation: Observation) -> tuple[Array, dict[str, Any], float, float]:
         """Observation and info; the angle still to turn about the grasp's axis, and what turned about others
         since the reset [rad]."""
         assert self._start is not None

@@ -318,7 +318,7 @@ class SimulatedHand:
         return KinematicModel(self.hand, self.object, ModelOptions(on_unstable="flag"))
 
     def _softened(self, plan: PinchPlan) -> bool:
-        """Its forces have made the grasp soft, as far as the model knows it."""
+        """Its forces have made the grasp soft, by the model."""
         named = dict(zip(plan.pads, -np.einsum("ci,ci->c", plan.forces, plan.normals), strict=True))
         (force,) = _tensors(np.array([named.get(pad.name, 0.0) for pad in self.hand.pads]))
         try:

@@ -1,17 +1,202 @@
-"""The relaxed force problem as a quadratic program."""
+"""The program of contact forces: its options, friction, balance, and rows."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from enum import Enum
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..._checks import check_positive
 from ..._extras import require
+from ..._noise import NOISE
 from ...typing import Array
+from ..contact_kinematics import ContactModel
 from ..contact_set import CHARACTERISTIC_LENGTH
-from .balance import BalanceEquations
-from .friction import outer_directions
-from .options import ForceOptions
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ForceOptions:
+    """Standard deviations of the force problem, all of them positive.
+
+    Raises:
+        ParameterError: a value outside its range.
+    """
+
+    torque_std: float = 0.01
+    """Standard deviation of unmodelled joint torque, Sigma_tau^(1/2) [N m]."""
+    normal_std: float = NOISE.force
+    """Standard deviation of a measured normal force [N]."""
+    start_std: float = 1.5
+    """Standard deviation of a contact force of which nothing is known yet, per axis [N]."""
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            check_positive(one.name, getattr(self, one.name))
+
+
+@dataclass(frozen=True)
+class FrictionCone:
+    """Cone of one contact inside the stacked force vector ``mu``."""
+
+    start: int
+    """Position of the normal force in ``mu``; the friction components follow it."""
+    scale: Array
+    """Diagonal that makes ``u`` of the friction components, ``(d,)``: 1, 1, mu_s/gamma."""
+    mu_s: float
+
+    @property
+    def dim(self) -> int:
+        """Number of friction components d: 0 (frictionless), 1 (planar), 2 (point contact), 3 (soft)."""
+        return len(self.scale)
+
+    def u(self, mu: Array) -> Array:
+        """Friction components ``u`` of the force vector, scaled to newtons."""
+        return self.scale * mu[..., self.start + 1 : self.start + 1 + self.dim]
+
+    def slack(self, mu: Array) -> float:
+        """``mu_s f_n - |u|`` [N]; negative: outside the cone."""
+        return float(self.mu_s * mu[self.start] - np.linalg.norm(self.u(mu)))
+
+    def rows(self, directions: Array, n_h: int) -> Array:
+        """Rows ``g`` of ``g mu <= 0``: ``d . u <= mu_s f_n`` for each direction ``(k, d)``."""
+        rows = np.zeros((len(directions), n_h))
+        rows[:, self.start] = -self.mu_s
+        rows[:, self.start + 1 : self.start + 1 + self.dim] = directions * self.scale
+        return rows
+
+
+def friction_cones(
+    models: Sequence[ContactModel], mu_s: Sequence[float], gamma: Sequence[float]
+) -> tuple[FrictionCone, ...]:
+    """The cones of contacts whose components are stacked in the order of the models' rows."""
+    cones, start = [], 0
+    for model, friction, torsional in zip(models, mu_s, gamma, strict=True):
+        scale = np.ones(len(model.rows) - 1)
+        if model is ContactModel.SOFT_FINGER:
+            scale[2] = friction / max(torsional, 1e-9)
+        cones.append(FrictionCone(start, scale, float(friction)))
+        start += len(model.rows)
+    return tuple(cones)
+
+
+@lru_cache(maxsize=4)
+def outer_directions(dim: int) -> Array:
+    """Unit normals d of a polyhedron ``{d . u <= 1}`` around the unit ball, ``(k, dim)``.
+
+    Eight around a circle; for a soft finger rings of eight over the latitudes and the two poles.
+    """
+    if dim == 0:
+        return np.zeros((0, 0))
+    if dim == 1:
+        return np.array([[1.0], [-1.0]])
+    angle = 2 * np.pi * np.arange(8) / 8
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    if dim == 2:
+        return ring
+    latitude = np.linspace(-np.pi / 2, np.pi / 2, 5)[1:-1]
+    layers = [np.concatenate([np.cos(t) * ring, np.full((8, 1), np.sin(t))], axis=-1) for t in latitude]
+    return np.concatenate([*layers, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
+
+
+def cutting_planes(cones: Sequence[FrictionCone], mu: Array, tolerance: float) -> Array:
+    """Rows ``g mu <= 0`` that cut off ``mu`` where it violates a cone by more than ``tolerance`` [N]."""
+    cuts = [np.zeros((0, len(mu)))]
+    for cone in cones:
+        if cone.dim > 1 and cone.slack(mu) < -tolerance:
+            u = cone.u(mu)
+            cuts.append(cone.rows((u / np.linalg.norm(u))[None], len(mu)))
+    return np.concatenate(cuts)
+
+
+def margins(cones: Sequence[FrictionCone], mu: Array) -> tuple[Array, Array]:
+    """Per contact ``mu_s f_n - |u|`` [N], and that relative to ``mu_s f_n``: 1 no friction used, 0 slips."""
+    slack = np.array([cone.slack(mu) for cone in cones])
+    limit = np.array([cone.mu_s * mu[cone.start] for cone in cones])
+    relative = np.divide(slack, limit, out=np.zeros_like(slack), where=limit > 1e-12)
+    return slack, relative
+
+
+class ForceStatus(Enum):
+    """Whether the force problem was solved, is impossible, or made the solver fail."""
+
+    SOLVED = "solved"
+    NOT_GRASPABLE = "not_graspable"
+    """No forces inside the cones and bounds balance the object."""
+    FAILED = "failed"
+    """The solver gave up; nothing is known."""
+
+
+@dataclass(frozen=True)
+class BalanceEquations:
+    """Equilibrium at one state, reduced to the permitted motions (rigid couplings taken out).
+
+    ```
+    object_matrix mu = object_load                         G mu = V_p
+    hand_matrix mu + actuator_matrix lam + bound_matrix tau - r = -hand_load
+    ```
+    """
+
+    object_matrix: Array
+    """G, contact forces to the wrench on the object, ``(n_w, n_h)``."""
+    object_load: Array
+    """V_p, gradient of the potential energy by the object's pose [N, N m], ``(n_w,)``."""
+    hand_matrix: Array
+    """(J_h Z)^T, ``(n_z, n_h)``."""
+    actuator_matrix: Array
+    """(J_a Z)^T, ``(n_z, n_a)``."""
+    hand_load: Array
+    """Z^T V_q, torques of the springs in the permitted motions [N m], ``(n_z,)``."""
+    cones: tuple[FrictionCone, ...]
+    moment_rows: Mask
+    """Rows of ``object_load`` that are moments, bool ``(n_w,)``."""
+    tendon: Mask
+    """Actuators that only pull, bool ``(n_a,)``."""
+    spin_columns: tuple[int, ...] = ()
+    """Components of ``mu`` that are moments."""
+    bound_matrix: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    """Z^T of unit joint torques with bounds of their own (stops), ``(n_z, n_t)``."""
+    bound_lower: Array = field(default_factory=lambda: np.zeros(0))
+    bound_upper: Array = field(default_factory=lambda: np.zeros(0))
+    measured_normal: Array | None = None
+    """Measured normal forces [N], NaN where there is none."""
+    expected: Array | None = None
+    """Forces ``mu`` to stay near, ``(n_h,)``."""
+    expected_covariance: Array | None = None
+    """Of ``expected``, ``(n_h, n_h)``."""
+
+    @property
+    def row_scale(self) -> Array:
+        """1 for forces on the object, 1/L for moments, ``(n_w,)``."""
+        return np.where(self.moment_rows, 1 / CHARACTERISTIC_LENGTH, 1.0)
+
+
+@dataclass(frozen=True)
+class ForceSolution:
+    """Forces in the order of the problem's unknowns; NaN unless solved."""
+
+    status: ForceStatus
+    mu: Array
+    """[N], moment rows [N m]."""
+    lam: Array
+    """Minus the actuator forces along +a [N or N m]."""
+    bound: Array
+    """Torques of stops [N m]."""
+    residual: Array
+    """r: unexplained generalised torque, ``(n_z,)`` [N m]. Large: wrong spring or rest angle, slipping."""
+    violation: float
+    """Smallest norm of the unbalanced object wrench (moments divided by L) [N]; about 0 when solved."""
+    solves: int
+    """Number of QPs; 0: the answer without inequalities keeps them all."""
+    covariance: Array | None = None
+    """Of ``mu`` about the answer, ``(n_h, n_h)``; None without ``expected_covariance``."""
+
 
 MAX_NORMAL = 1e3
 """Upper bound of every normal force [N]; the lower one is 0."""

@@ -29,13 +29,8 @@ _R, _E = StopReason, Effect
 
 
 class FingertipTests:
-    """Of one manipulation.
-
-    Args:
-        guards: limits.
-        model: f, with the hand.
-        usual: how many times the fingertips of this hand read what joints and springs give; None: unknown.
-    """
+    """Of one manipulation. The fingertips of this hand are ``usual`` to read so many times what joints and
+    springs give; None: that is unknown."""
 
     def __init__(self, guards: Guards, model: KinematicModel, usual: float | None) -> None:
         self.guards, self.hand, self.model, self._usual = guards, model.hand, model, usual
@@ -73,7 +68,7 @@ class FingertipTests:
     def after(
         self, before: Observation, decision: Decision, seen: Observation
     ) -> tuple[Tensor | None, list[Objection]]:
-        """Forces that are believed after a motion [N], 0 of a pad at fault; and what is found."""
+        """Forces that are used after a motion [N], 0 of a pad at fault; and what is found."""
         force, taken, most = seen.fingertip_force, seen.taken.fingertips, self.guards.max_age.fingertips
         if force is None:
             return None, []
@@ -124,7 +119,7 @@ class FingertipTests:
 
     def _scale(self, seen: Observation, force: Tensor) -> list[Objection]:
         """All fingertips together read much more or less than joints and springs give: than they do on this
-        hand, or, where none of its grasps is known, than described. That is told, and learned."""
+        hand, or, where none of its grasps is known, than described. That is reported, and learned."""
         alone = {i: other for i, other in self._by_joints(seen).items() if force[i] > self._least}
         measured, other = float(force[list(alone)].sum()), sum(alone.values())
         if len(alone) < 2 or other < measured / _NOTHING:

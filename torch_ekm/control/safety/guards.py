@@ -61,7 +61,7 @@ class Guards:
     increment: float = 20 * DEGREE
     """Largest command to an actuator, as it leaves the :class:`~torch_ekm.plant.Gate` [rad]."""
     speed: float = 3.0
-    """Of an encoder, mean over a motion; and of commands beyond ``increment`` [rad/s]."""
+    """Of commands beyond ``increment`` [rad/s]."""
     stuck_command: float = 4 * DEGREE
     """An actuator that stands still in two such commands running is stuck [rad]; so is one that the
     servo model calls so."""

@@ -28,11 +28,6 @@ class OnTheWay:
     The object's rotation in a picture is held against that of the path where the encoders were when it was
     taken, and against the band there, which grows with the way; forces against those of the path, of which a
     finger keeps half and more.
-
-    Args:
-        guards: limits.
-        seen: where the movement begins.
-        decision: the movement.
     """
 
     why = ""

@@ -21,18 +21,13 @@ if TYPE_CHECKING:
 _SENSORS = "the encoders' reading", "the joints' reading", "the object's pose"
 _DRIVER = "check its driver or its time stamps"
 CHECK_PLANT = "see 'torch-ekm check --plant'"
-AGAINST = 0.3  # share of a motion that is made the other way; healthy hands make .4 of it and more
+_MIRRORED = 0.5  # of the distance from a path, within which of its mirror image motors have gone back
 _LEVER = 0.03  # [m] a rotation that is predicted wrong carries the object's point so much
 _TWICE = math.sqrt(2)  # times the noise of a reading that of a difference is
 
 
 class ReadingTests:
-    """Tests of readings against :class:`~torch_ekm.control.Guards`.
-
-    Args:
-        guards: limits.
-        hand: gives names and ranges of encoders and joints.
-    """
+    """Tests of readings against :class:`~torch_ekm.control.Guards`; the hand gives names and ranges."""
 
     def __init__(self, guards: Guards, hand: HandDescription) -> None:
         self.guards, self.hand = guards, hand
@@ -57,7 +52,7 @@ class ReadingTests:
         pose came before."""
         said = self._ages(seen, before)
         unseen = bool(said)  # the rest is still looked at
-        said += [*self.motors(before, sent, seen), *self._speed(before, seen)]
+        said += self.motors(before, sent, seen)
         if expected is not None:
             ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
             said += self._jumps(ds, predicted, seen, unseen)
@@ -98,7 +93,7 @@ class ReadingTests:
         return joint > _TWICE * self.guards.joint_noise and not agree(one, other, self.guards)
 
     def motors(self, before: Observation | None, sent: Tensor | None, seen: Observation) -> list[Objection]:
-        """Ranges, and encoders after the motors were sent by ``sent`` [rad]; None: nowhere."""
+        """Ranges, and encoders after the motors were sent through ``sent`` [rad]; None: nowhere."""
         hand, guards, said = self.hand, self.guards, []
         for what, names, lower, upper, value in (
             ("encoder", hand.actuator_names, hand.actuator_lower, hand.actuator_upper, seen.a),
@@ -112,29 +107,25 @@ class ReadingTests:
             said += against(beyond[i] > guards.beyond, StopReason.OUT_OF_RANGE, out)
         if before is None:
             return said
-        moved, v = (seen.a - before.a).numpy(), np.zeros(len(seen.a)) if sent is None else sent.numpy()
-        most = guards.unchanged if sent is None else guards.encoder_jump
+        moved, way = (seen.a - before.a).numpy(), np.zeros((1, len(seen.a))) if sent is None else sent.numpy()
+        v, most = way[-1], guards.unchanged if sent is None else guards.encoder_jump
         away = np.maximum(np.minimum(v, 0) - moved, moved - np.maximum(v, 0))  # further than sent, or back
         i = int(away.argmax())
         jump = f"encoder '{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were commanded "
         jump += f"({deg(most)} more are allowed, Guards.encoder_jump): check its cable and zero"
-        said += against(away[i] > most, StopReason.ENCODER_JUMP, jump)
-        if abs(v).max() >= guards.unchanged:
-            share, i = float(moved @ v) / float(v @ v), int((moved * v).argmin())
-            back = f"encoders made {share:.1f} of the motion that was commanded (limit -{AGAINST:g}): "
-            back += f"'{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were"
-            back += f": a sign of the motors or of their encoders is wrong; {CHECK_PLANT}"
-            said += against(-share > AGAINST, StopReason.WRONG_WAY, back)
-        return said
-
-    def _speed(self, before: Observation, seen: Observation) -> list[Objection]:
-        if not (seen.dated and before.dated):
-            return []
-        moved, most = (seen.a - before.a).numpy(), self.guards.speed
-        seconds, i = max(seen.taken.encoders - before.taken.encoders, 0.0), int(abs(moved).argmax())
-        fast = f"encoder '{self.hand.actuator_names[i]}' went {deg(moved[i])} in {seconds:.3g} s "
-        fast += f"(Guards.speed is {deg(most)}/s): the driver must wait for the end of a motion, and date it"
-        return against(abs(moved[i]) > most * seconds, StopReason.SPEED_CEILING, fast)
+        jumped = against(away[i] > most, StopReason.ENCODER_JUMP, jump)
+        if abs(v).max() < guards.unchanged:
+            return said + jumped
+        # no share of the path: a movement that was ended on the way, or an encoder that jumps, has any
+        (off, mirrored), i = (_off_path(x, way) for x in (moved, -moved)), int((moved * v).argmin())
+        back = (
+            f"encoders made {moved @ v / (v @ v):.1f} of the motion that was commanded: they are {deg(off)} "
+        )
+        back += f"off its path and {deg(mirrored)} off its mirror image (limit {deg(guards.unchanged)}); "
+        back += f"'{hand.actuator_names[i]}' went {deg(moved[i])} where {deg(v[i])} were"
+        back += f": a sign of the motors or of their encoders is wrong; {CHECK_PLANT}"
+        wrong = off > guards.unchanged and mirrored < _MIRRORED * off
+        return said + against(wrong, StopReason.WRONG_WAY, back) + jumped
 
     def _jumps(self, ds: Array, predicted: Array, seen: Observation, unseen: bool = False) -> list[Objection]:
         """What no motion does; of a pose that is not seen: nothing."""
@@ -178,7 +169,7 @@ class ReadingTests:
         """Variances of a measured increment ``(n_s,)``; of poses as stated, and no less than the guards'."""
         least = np.array(_pose_std(self.guards)) ** 2
         pose = 0 * least
-        for cov in (_stated(before), _stated(seen)):
+        for cov in (stated(before), stated(seen)):
             pose += least if cov is None else np.maximum(np.nan_to_num(cov.diagonal().numpy()), least)
         return np.concatenate([np.full(self.hand.n_q, 2 * self.guards.joint_noise**2), pose])
 
@@ -191,7 +182,7 @@ class ReadingTests:
 
     def pose_noise(self, seen: Observation, focus: FocusedPose) -> float:
         """Standard deviation of a pose in the focus, as a turn [rad]: as stated, or the guards'."""
-        cov = _stated(seen)
+        cov = stated(seen)
         if cov is None or not bool(torch.isfinite(cov).all()):
             cov = torch.diag(torch.tensor(_pose_std(self.guards)).double().square())
         M = focus.matrix
@@ -214,6 +205,14 @@ class ReadingTests:
         return torch.equal(seen.q, last.q), stands
 
 
+def _off_path(x: Array, way: Array) -> float:
+    """Distance of a point from the line through the origin and waypoints ``(n, n_a)``."""
+    start = np.vstack([0.0 * x, way[:-1]])
+    along = way - start
+    share = ((x - start) * along).sum(1) / np.maximum((along * along).sum(1), 1e-12)
+    return float(np.linalg.norm(x - start - share.clip(0.0, 1.0)[:, None] * along, axis=1).min())
+
+
 def agree(one: Observation, other: Observation, guards: Guards) -> bool:
     """Two readings of a hand at rest show the same."""
     ds = other.state.minus(one.state)
@@ -226,6 +225,6 @@ def _pose_std(guards: Guards) -> list[float]:
     return [guards.translation_noise] * 3 + [NOISE.rotation] * 3
 
 
-def _stated(seen: Observation) -> Tensor | None:
+def stated(seen: Observation) -> Tensor | None:
     """Covariance of its pose, as the plant states it."""
     return seen.info.get("estimate", {}).get("pose_covariance")

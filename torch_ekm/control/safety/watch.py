@@ -1,4 +1,4 @@
-"""Whether a reading may move the hand or teach: what :class:`Guards` say of each motion of a closed loop."""
+"""Whether a reading is plausible: the tests of :class:`Guards` in each motion of a closed loop."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Look = Callable[[], Observation]
 
 
 class Verdict(NamedTuple):
-    """What is believed after a motion."""
+    """The reading that is used after a motion."""
 
     seen: Observation
     """The reading to go on with; of a blind motion with the pose that the model predicted."""
     teaches: bool
-    """Both ends of the motion were measured, and nothing speaks against them."""
+    """Both ends of the motion were measured, and no test fails."""
     halt: Objection | None = None
     """Why the manipulation must end here."""
     note: str = ""
@@ -45,13 +45,7 @@ class Verdict(NamedTuple):
 
 
 class Watch:
-    """The guards of one manipulation.
-
-    Args:
-        guards: limits.
-        model: f, with the hand.
-        knowledge: of the hand.
-    """
+    """The guards of one manipulation."""
 
     blind = 0
     """Motions in succession without a pose."""
@@ -60,7 +54,7 @@ class Watch:
     slid = ""
     """How the object has slid in the last motion, farther than the guards let a pose jump; or empty."""
     lie = ""
-    """A sensor that went wrong while all seemed well, so that nothing is learned; or empty."""
+    """A sensor that contradicts the others, so that nothing is learned; or empty."""
     doubt = ""
     """A fingertip at fault, or on a hand of which nothing is known all of them; or empty."""
 
@@ -73,8 +67,9 @@ class Watch:
         self._still = torch.zeros(self.hand.n_a, dtype=torch.long)
         self._undated = ""
 
-    def first(self, seen: Observation, look: Look) -> Verdict:
-        """The reading before the first motion; further ones from ``look`` where it is in doubt."""
+    def first(self, seen: Observation, look: Look) -> tuple[Observation, Objection | None]:
+        """The reading before the first motion, and what speaks against it; ``look`` gives another where it is
+        in doubt."""
         doubt = None
         for left in range(_LOOKS, -1, -1):
             doubt = None if seen.status is PlantStatus.LOST else self.readings.at_rest(seen)
@@ -85,7 +80,7 @@ class Watch:
         self.motions.begin(seen)
         self._undated = "" if seen.dated else _UNDATED
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
-        return Verdict(seen, doubt is None, doubt)
+        return seen, doubt
 
     def motion(
         self,
@@ -96,12 +91,8 @@ class Watch:
         expect: Callable[[Tensor], Expectation],
         look: Look,
     ) -> Verdict:
-        """Judge a movement of the motors by ``sent`` [rad].
-
-        Args:
-            expect: f + g of what the encoders did.
-            look: gives another reading where the first is in doubt.
-        """
+        """Judge a movement of the motors by ``sent`` [rad]; ``expect`` gives f + g of what the encoders did,
+        ``look`` another reading where the first is in doubt."""
         seen, last, doubt, expected = self._look(before, decision, sent, after, expect, look)
         self.slid = ""
         if seen.status is PlantStatus.LOST:
@@ -116,8 +107,11 @@ class Watch:
         self.readings.follow(before, seen)
         if force is not seen.fingertip_force:
             seen = dataclasses.replace(seen, fingertip_force=force)
-        if doubt is not None and (doubt.effect is Effect.BLIND or not sure):
-            return self._verdict(*self._blind(before, seen, doubt, expected), doubt, expected, said)
+        if doubt is not None and (doubt.effect is Effect.BLIND or not sure):  # the model predicts the pose
+            pose = before.state if expected is None else before.state.plus(expected.increment)
+            at = {"position": pose.position, "rotation": pose.rotation, "status": PlantStatus.NOT_SEEN}
+            self.blind += 1
+            return self._verdict(dataclasses.replace(seen, **at), False, doubt, expected, said)
         if not self.slid:
             said += self._in_succession(self.motions.after(before, sent, seen, expected))
         measured, self.blind, self.gated = self.blind == 0, 0, 0 if doubt is None else self.gated + 1
@@ -154,15 +148,6 @@ class Watch:
         told = {key: f"{one.message} (motions running: {self._running[key]})" for key, one in raised.items()}
         return said + [Objection(key[0], told[key]) for key, n in self._running.items() if n >= key[1]]
 
-    def _blind(
-        self, before: Observation, seen: Observation, doubt: Objection, expected: Expectation | None
-    ) -> tuple[Observation, bool]:
-        """With the pose that the model predicts for what the encoders did, which teaches nothing."""
-        pose = before.state if expected is None else before.state.plus(expected.increment)
-        self.blind += 1
-        status = PlantStatus.NOT_SEEN
-        return dataclasses.replace(seen, position=pose.position, rotation=pose.rotation, status=status), False
-
     def _verdict(
         self,
         seen: Observation,
@@ -192,8 +177,8 @@ class Watch:
         where the pads that press lie on the object; empty: it is not."""
         if expected is None:
             return ""
-        surprise = felt(self.hand, expected, before, seen) if reason is StopReason.POSE_JUMP else None
-        changed = surprise is not None and surprise.wrong(before)
+        came = felt(self.hand, expected, before, seen) if reason is StopReason.POSE_JUMP else None
+        changed = came is not None and came.wrong
         if not (changed or (reason is StopReason.JOINT_JUMP and self.motions.on_surface(seen))):
             return ""
         ds = (seen.state.minus(before.state) - expected.increment)[-6:]
@@ -218,11 +203,7 @@ class Watch:
     def stuck(
         self, before: Observation, decision: Decision, seen: Observation, stuck: Tensor
     ) -> Objection | None:
-        """Actuators that do not move, however they are commanded.
-
-        Args:
-            stuck: which the servo model calls so.
-        """
+        """Actuators that do not move, however they are commanded; some the servo model calls ``stuck``."""
         size, still = decision.delta_a.abs(), (seen.a - before.a).abs() < _STILL
         self._still = (self._still + 1) * (still & (size > self.guards.stuck_command))
         which = (self._still > 1) | (stuck & still & (size > NOISE.dead_zone))

@@ -11,6 +11,7 @@ from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,50 +23,86 @@ from ...typing import Array
 Names = tuple[str, ...]
 #: Values ``(n_rows, n)`` of the n columns that it is given.
 Read = Callable[[Sequence[str]], Array]
-Records = Callable[[], Iterator[tuple[int, list[str]]]]
 
 _LARGEST = 128 << 20  # bytes: a figure of one digit takes four times as much in memory
 _LONGEST = 1 << 20  # characters of one record, which is a line where no quoted text has line breaks
-_SEPARATORS = ",;\t"
+_SEPARATORS = ",;\t "
 _EXCEL = re.compile(r'"?sep=([,;\t|:^~])"?', re.IGNORECASE)
-_TRIED = 6  # records that tell which separator it is
+_TRIED, _LINES = 6, 1000  # records that decide on the separator, and lines in which they are looked for
+
+
+class _Table(NamedTuple):
+    """A text, as one separator parts it."""
+
+    path: Path
+    text: str
+    before: int
+    """Lines before the header."""
+    separator: str
+
+    def records(self, most: int | None = None) -> Iterator[tuple[int, list[str]]]:
+        """Those of all or of ``most`` lines that are not blank, with the number of their last line; the first
+        may be a comment."""
+        length = number = 0
+
+        def lines() -> Iterator[str]:  # knows nothing of the reader: a circle would keep the text in memory
+            nonlocal length, number
+            end = None if most is None else self.before + most
+            wanted = itertools.islice(io.StringIO(self.text, newline=""), self.before, end)
+            for number, line in enumerate(wanted, self.before + 1):
+                length += len(line)
+                if length > _LONGEST:
+                    problem = f"has more than {_LONGEST} characters, or stands in a quote that does not close"
+                    raise DescriptionError(self.path, f"line {number} {problem}")
+                yield line.lstrip(" " if number > self.before + 1 else "# ")
+
+        try:
+            for row in csv.reader(lines(), delimiter=self.separator, skipinitialspace=True):
+                length = 0
+                if len(row) > 1 or (row and row[0].strip()):
+                    yield number, [field.strip() for field in row]
+        except csv.Error as error:
+            raise DescriptionError(self.path, f"line {number}: {error}") from None
 
 
 def open_csv(path: Path, label: str) -> tuple[Names, Read]:
     """Column names, and a function that reads some of them.
 
-    UTF-8, of at most 128 MiB. Separated by comma, semicolon or tab: by the one that gives the first lines as
-    many fields as the header, texts in quotes apart; or as a first line ``sep=;`` says. Lines before the
-    header may be comments, ``# ...``. The header names the columns. Every other field that is read is a
-    number with a decimal point. Blanks around fields, empty lines, and a separator at the end of a line do
-    not count.
+    UTF-8, of at most 128 MiB. Separated by comma, semicolon, tab or blanks: by the one that gives the first
+    lines as many fields as the header, texts in quotes apart; or as a first line ``sep=;`` says. The header
+    names the columns. Lines before it may be comments, ``# ...``; the last of them is the header where only
+    numbers follow, as of ``numpy.savetxt``. Every other field that is read is a number with a decimal point.
+    Blanks around fields, empty lines, and a separator at the end of a line do not count.
 
     Raises:
         DescriptionError: the file cannot be used; the message names line and column. The function raises
             it, too.
     """
     text = decode(read_file(path, "file of a table", _LARGEST), path)
-    before, given = _preamble(text)
-    tried = [partial(_records, path, text, before, one) for one in given or _SEPARATORS]
-    records = max(tried, key=_fit)
-    number, names = next(records(), (0, []))
-    if not names:
+    if not text or text.isspace():
         raise DescriptionError(path, "the file is empty")
-    names = _trimmed(names, len(names) - 1)
+    before, given = _preamble(text)
+    table = max((_Table(path, text, before, one) for one in given or _SEPARATORS), key=_fit)
+    number, names = next(table.records(), (0, []))
+    names = _trimmed(names, n := len(names) - 1)
     if all(figure(field) is not None for field in names):
-        problem = "holds numbers only; the first line that does not begin with # must name the columns"
-        raise DescriptionError(path, f"line {number} {problem}")
-    return tuple(names), partial(_read, path, tuple(names), records, label)
+        table = table._replace(before=before - 1)
+        names = _trimmed(next(table.records())[1], n) if before else []
+        if len(names) <= n or all(figure(field) is not None for field in names):
+            problem = "holds numbers only; it, or a comment right before it, must name the columns"
+            raise DescriptionError(path, f"line {number} {problem}")
+    return tuple(names), partial(_read, table, tuple(names), label)
 
 
-def _fit(records: Records) -> tuple[bool, int]:
+def _fit(table: _Table) -> tuple[bool, int]:
     """How well a separator does: whether the first lines have as many fields as the header, and how many."""
     try:
-        first = [row for _, row in itertools.islice(records(), _TRIED)]
+        first = [row for _, row in itertools.islice(table.records(_LINES), _TRIED)]
     except DescriptionError:
         return False, 1
     names = _trimmed(first[0], len(first[0]) - 1) if first else []
-    return all(len(_trimmed(row, len(names))) == len(names) > 1 for row in first), len(names)
+    fits = all(len(_trimmed(row, len(names))) == len(names) > 1 for row in first)
+    return fits, 1 if table.separator == " " and not fits else len(names)  # names may hold blanks
 
 
 def _preamble(text: str) -> tuple[int, str]:
@@ -73,34 +110,11 @@ def _preamble(text: str) -> tuple[int, str]:
     separator = ""
     for number, line in enumerate(io.StringIO(text, newline="")):
         line = line.strip("\r\n")
-        told = _EXCEL.fullmatch(line)
-        if told is None and line.strip() and not line.startswith("#"):
+        stated = _EXCEL.fullmatch(line)
+        if stated is None and line.strip() and not line.startswith("#"):
             return number, separator
-        separator = told[1] if told else separator
+        separator = stated[1] if stated else separator
     return 0, separator
-
-
-def _records(path: Path, text: str, before: int, separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Records that are not blank, with the number of their last line."""
-    length = 0
-
-    def lines() -> Iterator[str]:
-        nonlocal length
-        for line in itertools.islice(io.StringIO(text, newline=""), before, None):
-            length += len(line)
-            if length > _LONGEST:
-                problem = f"has more than {_LONGEST} characters, or stands in a quote that does not close"
-                raise DescriptionError(path, f"line {before + reader.line_num + 1} {problem}")
-            yield line
-
-    reader = csv.reader(lines(), delimiter=separator, skipinitialspace=True)
-    try:
-        for row in reader:
-            length = 0
-            if len(row) > 1 or (row and row[0].strip()):
-                yield before + reader.line_num, [field.strip() for field in row]
-    except csv.Error as error:
-        raise DescriptionError(path, f"line {before + reader.line_num}: {error}") from None
 
 
 def _trimmed(row: list[str], n: int) -> list[str]:
@@ -108,8 +122,8 @@ def _trimmed(row: list[str], n: int) -> list[str]:
     return row[:n] if n > 0 and len(row) == n + 1 and not row[-1] else row
 
 
-def _read(path: Path, names: Names, records: Records, label: str, columns: Sequence[str]) -> Array:
-    rows = partial(_rows, path, len(names), records)
+def _read(table: _Table, names: Names, label: str, columns: Sequence[str]) -> Array:
+    rows = partial(_rows, table, len(names))
     places = [names.index(name) for name in columns]
     numbers: list[Callable[[str], float | None]] = [figure] * len(columns)
     if label in columns:
@@ -127,16 +141,16 @@ def _read(path: Path, names: Names, records: Records, label: str, columns: Seque
         n += 1
     if bad:
         more = f". {bad} of {n} lines have a field that is no finite number" if bad > 1 else ""
-        raise DescriptionError(path, first + more)
+        raise DescriptionError(table.path, first + more)
     return np.array(taken).reshape(n, len(places))
 
 
-def _rows(path: Path, n: int, records: Records) -> Iterator[tuple[int, list[str]]]:
-    for line, row in itertools.islice(records(), 1, None):
+def _rows(table: _Table, n: int) -> Iterator[tuple[int, list[str]]]:
+    for line, row in itertools.islice(table.records(), 1, None):
         row = _trimmed(row, n)
         if len(row) != n:
             problem = f"has {len(row)} fields, but the header names {n} columns"
-            raise DescriptionError(path, f"line {line} {problem}")
+            raise DescriptionError(table.path, f"line {line} {problem}")
         yield line, row
 
 

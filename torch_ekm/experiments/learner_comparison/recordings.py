@@ -60,7 +60,7 @@ def load_recording(
             raise ParameterError("observation", observation, valid)
         which = Columns(columns.get("inputs") or observation, (), observation)
         return load_own(name, which, clock=columns.get("clock")).stream(limit)
-    if Path(name).suffix or columns.get("clock"):
+    if Path(name).suffix or Path(name).exists() or columns.get("clock"):
         return load_table(name, limit=limit, **columns)
     known = ("simulated_hand", *_READERS, "a path to a file")
     raise UnknownNameError("recording", str(name), known)

@@ -78,8 +78,8 @@ def score_table(comparison: Comparison, stream: str) -> Table:
     d, m = one.x.shape[1], one.y.shape[1]
     note += f"{d} inputs, {m} {'output' if m == 1 else 'outputs'}. * best; below 1 a learner helps. "
     note += f"95 % intervals; {measure} / best is paired: above 1 where its interval is. "
-    note += "Median: of the absolute errors, insensitive to outliers; it decides where a hundredth of the "
-    note += "rows makes more than half of the squared error. NLL: per sample and output. "
+    note += "Median errors decide where 1 % of the rows make more than half of the squared error. "
+    note += "NLL: per sample and output. "
     note += "Time: one prediction and one update."
     return Table.of(f"scores_{stream}", f"{stream}: {one.about}", "learner", items, columns, note)
 

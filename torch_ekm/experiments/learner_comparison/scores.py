@@ -185,12 +185,7 @@ def blocks_of(stream: Stream) -> NDArray[np.int64]:
 
 
 def block_bootstrap(
-    ours: Array,
-    theirs: Array,
-    blocks: NDArray[np.int64],
-    seed: int = 0,
-    resamples: int = 2000,
-    measure: Measure = "rms",
+    ours: Array, theirs: Array, blocks: NDArray[np.int64], measure: Measure = "rms"
 ) -> Estimate:
     """``sqrt(sum ours / sum theirs)``, or of medians, with its 95 % percentile interval over blocks.
 
@@ -200,7 +195,7 @@ def block_bootstrap(
         measure: a mean or a median of the squared errors before the root.
     """
     _, index = np.unique(blocks, return_inverse=True)
-    n, options = int(index.max()) + 1, {"seed": seed, "resamples": resamples}
+    n, options = int(index.max()) + 1, {"resamples": 2000}
     if measure == "rms":
         sums = (np.bincount(index, weights=squared) for squared in (ours, theirs))
         return bootstrap(lambda a, b, axis: _root_ratio(a.sum(axis), b.sum(axis)), *sums, **options)

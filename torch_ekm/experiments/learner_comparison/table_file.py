@@ -64,9 +64,8 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
     kind = path.suffix.lower()
     if kind not in _READERS and (os.path.isdir(path) or kind in _BAGS):
         if clock is None:
-            raise ParameterError(
-                "clock", clock, "a topic whose messages set the rows, such as that of the commands"
-            )
+            valid = "a topic whose messages set the rows (--clock), such as that of the commands"
+            raise ParameterError("clock", clock, valid)
         bag = interop.read_bag(path, clock)
         return bag.names, partial(_bag_rows, path, bag)
     if not os.path.isfile(path):

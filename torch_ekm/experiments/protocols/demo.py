@@ -1,35 +1,45 @@
-"""The main job: a grasped object turned through the paper's angles, with the KM and with the E-KM."""
+"""The main job: a grasped object turned through the paper's angles, then objects that are new to the hand."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from ...control import StopReason
 from ...description import load_hand, load_object
 from ...exceptions import EKMError
-from ...rendering import Told, make_scene, save_animation, save_picture
+from ...rendering import Captions, make_scene, save_animation, save_picture
+from ..config import digest
+from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
-from ..reporting.report import FigureFile, Report
+from ..reporting.report import Cell, Column, FigureFile, Report, Table
 from ..reporting.statistics import DataFrame
-from ..reporting.tables import group_table
+from ..reporting.tables import by_object, group_table
 from ..reporting.trials import select
+from ..runner import Bench, new_objects
 from .generalize import Generalize
+
+#: Turns of each new object [deg].
+_NEW_ANGLES = (9.0, 19.0)
 
 
 @dataclass(frozen=True)
 class Demo(Generalize):
-    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and with pictures."""
+    """One object of :class:`Generalize` with the KM and with an E-KM that starts empty, and with pictures.
+
+    Then, on the first seed, objects that the hand has never held; what it learned with the first one stays.
+    """
 
     objects: tuple[str, ...] = ("box",)
     warm_up: int = 0
     controllers: tuple[str, ...] = ("KM", "E-KM")
     poses: bool = True
+    new: tuple[str, ...] = ("can", "bottle", "weighted_box", "applier")
 
     @property
     def object(self) -> str:
@@ -37,18 +47,36 @@ class Demo(Generalize):
         return self.objects[0]
 
     def quick(self) -> Self:
-        """The same with the first two angles only."""
-        return dataclasses.replace(self, angles_deg=self.angles_of(self.object)[:2])
+        """The same with the first two angles only, and without new objects."""
+        return dataclasses.replace(self, angles_deg=self.angles_of(self.object)[:2], new=())
+
+    def jobs(self, seeds: Sequence[int]) -> dict[str, tuple[Any, ...]]:
+        """Those of the object, and for each controller one with the new objects."""
+        alone = dataclasses.replace(self, new=())
+        items = self.object, *(item for item in self.new if item != self.object)
+        own = digest(self.setting, items, "new objects", _NEW_ANGLES)
+        new = {f"new_{own}_{name}_{seeds[0]}": (items, name, seeds[0]) for name in self.controllers}
+        return super(Demo, alone).jobs(seeds) | (new if self.new else {})
+
+    def session(self, object: str | tuple[str, ...], controller: str, seed: int) -> list[TrialRecord]:
+        """Turns of one object; of several, those of objects that are new to the hand."""
+        if isinstance(object, str):
+            return super().session(object, controller, seed)
+        setting = self.setting.hardware_instance(seed)
+        return new_objects(
+            lambda item: Bench(setting, item, controller), object, seed, angles=_NEW_ANGLES, kind="new"
+        )
 
     def report(self, seeds: Sequence[int], trials: DataFrame, folder: Path) -> Report:
         """Report the turns, each target on its own, the motions, and pictures."""
-        report, turns = super().report(seeds, trials, folder), select(trials)
+        report, turns = super().report(seeds, trials, folder), select(trials, kind="turn")
         what, hand = _spoken(self.object), _spoken(self.setting.hand)
         report.title = f"Turning the {what} with the hand {hand}: KM and E-KM"
         shown = ("stop_reasons", "controllers", "prediction")
         by_angle = group_table(turns, "angle_deg", "each target")
-        report.tables = [by_angle] + [table for table in report.tables if table.name in shown]
-        report.leading = 1
+        leading = [by_angle, *([new_table(trials)] if self.new else [])]
+        report.tables = leading + [table for table in report.tables if table.name in shown]
+        report.leading = len(leading)
         report.figures = [*self._pictures(turns, folder), *self._motions(turns, folder), *report.figures]
         return report
 
@@ -85,10 +113,10 @@ class Demo(Generalize):
         what = f"{turn.angle_deg:g} deg (seed {turn.seed}) by the E-KM"
         left = np.array(turn.errors_deg)
         lines = tuple(f"motion {k}: {error:.2f} deg to go" for k, error in enumerate(left))
-        told = Told(
+        captions = Captions(
             f"{hand.name} turns {obj.name}: E-KM", lines, turn.angle_deg - left, target=turn.angle_deg
         )
-        save_animation(scene, folder / "animation.html", told, seconds=0.5)
+        save_animation(scene, folder / "animation.html", captions, seconds=0.5)
         moving = FigureFile("animation.html", f"A turn of {what}, motion by motion: drag to look around.")
         try:
             save_picture(scene, folder / "hand.png", frames=(0, -1))
@@ -96,6 +124,23 @@ class Demo(Generalize):
             return [moving]
         caption = f"The {_spoken(self.object)} before and after a turn of {what}, seen along the axis."
         return [FigureFile("hand.png", caption), moving]
+
+
+def new_table(trials: DataFrame) -> Table:
+    """How each controller turns objects that the hand has never held."""
+
+    def mean(name: str, figure: str) -> Callable[[DataFrame], Cell]:
+        return lambda mine: float(mine[mine["controller"] == name][figure].mean())
+
+    figures = (("error [deg]", "error_deg", ".2f"), ("motions", "motions", ".1f"))
+    columns = {
+        Column(f"{name}: {what}", spec): mean(name, figure)
+        for what, figure, spec in figures
+        for name in ("KM", "E-KM")
+    }
+    note = "One seed: means of the turns. The E-KM has learned the hand with the first object."
+    items = by_object(select(trials, kind="new"))
+    return Table.of("new_objects", "Objects that the hand has never held", "object", items, columns, note)
 
 
 def _spoken(name: str) -> str:

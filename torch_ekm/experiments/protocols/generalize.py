@@ -145,9 +145,10 @@ class Generalize(Protocol):
             summary += (
                 f" Turns of the E-KM with each object and seed before those that count: {self.warm_up}."
             )
-        if significance.rows:
+        if significance.rows and len(self.objects) > 1:
             won, *_, until = (row[-1] for row in significance.rows)
-            summary += f" Cells that the E-KM wins on one hand: {won}; significant after {until} turns."
+            summary += f" On one hand the E-KM ends nearer in {won} cells of object and target;"
+            summary += f" that is significant after turn {until} (medians over hands)."
         leading, legend = int(shown[0].name == "paper"), tables.legend(trials)
         title = "Generalisation: other objects, other weights"
         return Report(title, summary, shown, figures, leading=leading, legend=legend)
@@ -188,7 +189,7 @@ def significance_table(trials: DataFrame) -> Table:
         won = ekm[seeds] < km[seeds]
         lost = [f"{cell[0]}, trial {cell[1] + 1} ({n})" for cell, n in (~won).sum(axis=1).items() if n]
         until = np.median([stats.learning_curve(*hand).last_negative for hand in hands])
-        wins, units = won.sum(), tables.paired(chosen, "E-KM", "KM", "error_deg")
+        wins, units = won.sum(), tables.paired(chosen, "E-KM", "KM")
         rows = [
             ["cells won", "24 of 25", f"{wins.median():g} of {len(won)}, least {wins.min()}"],
             ["cells lost (hands)", "can, trial 2", "; ".join(lost) or "none"],

@@ -11,7 +11,6 @@ from typing import Self
 import numpy as np
 
 from ..._extras import require
-from ...exceptions import ParameterError
 from ...simulation import PlantChange, Tug
 from ..config import CONTROLLERS, Setting, digest, object_name
 from ..records import TrialRecord
@@ -37,9 +36,6 @@ class Online(Protocol):
 
     All trials of one seed are a session; an E-KM starts empty and keeps what it learns. Trials count
     from 1, as in the paper.
-
-    Raises:
-        ParameterError: an interval or the number of a trial outside its range.
     """
 
     setting: Setting = field(default_factory=Setting)
@@ -52,16 +48,6 @@ class Online(Protocol):
     tendons_replaced: int = 31
     """Before this trial the tendons are replaced (0: never)."""
     controllers: tuple[str, ...] = CONTROLLERS
-
-    def __post_init__(self) -> None:
-        low, high = self.angle_range_deg
-        if not 0 < low <= high < 180:
-            raise ParameterError("angle_range_deg", self.angle_range_deg, "0 < low <= high < 180 deg")
-        if self.trials < 1:
-            raise ParameterError("trials", self.trials, "at least 1")
-        if self.tendons_replaced < 0 or any(trial < 1 for trial in self.dislocations):
-            numbers = self.dislocations, self.tendons_replaced
-            raise ParameterError("dislocations, tendons_replaced", numbers, "trials from 1 on; 0: no tendons")
 
     @property
     def events(self) -> tuple[int, ...]:

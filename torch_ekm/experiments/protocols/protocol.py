@@ -4,7 +4,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 from ..config import Setting
 from ..records import TrialRecord
@@ -20,8 +20,6 @@ class Protocol(ABC):
     """
 
     setting: Setting
-    quick_seeds: ClassVar[int] = 2
-    """As many show that it works."""
 
     @abstractmethod
     def quick(self) -> Self:

@@ -1,18 +1,12 @@
-"""Where the notebooks are, copies of them, and whether they run in their smallest size."""
+"""Where the notebooks are, and copies of them."""
 
 from __future__ import annotations
 
-import os
 import shutil
 from pathlib import Path
 
 from ..._files import make_folder
 from ...exceptions import DescriptionError
-
-
-def smoke_mode() -> bool:
-    """Run everything in its smallest size: ``TORCH_EKM_SMOKE`` is set to anything but 0."""
-    return os.environ.get("TORCH_EKM_SMOKE", "0") not in ("", "0")
 
 
 def notebook_folder() -> Path:

@@ -55,9 +55,7 @@ class Estimate:
         return Estimate(factor * self.mean, factor * self.low, factor * self.high, self.n)
 
 
-def bootstrap(
-    statistic: Callable[..., Any], *values: NDArray[Any], seed: int = 0, resamples: int = 4000
-) -> Estimate:
+def bootstrap(statistic: Callable[..., Any], *values: NDArray[Any], resamples: int = 4000) -> Estimate:
     """A statistic with its 95 % percentile interval (``scipy.stats.bootstrap``).
 
     Args:
@@ -69,24 +67,24 @@ def bootstrap(
         return Estimate(found, found, found, n)
     resampled = require("scipy.stats").bootstrap(
         values, statistic, paired=True, vectorized=True, method="percentile", n_resamples=resamples,
-        rng=np.random.default_rng(seed),
+        rng=np.random.default_rng(0),
     )  # fmt: skip
     low, high = resampled.confidence_interval
     return Estimate(found, float(low), float(high), n)
 
 
-def bootstrap_mean(values: Array, **options: int) -> Estimate:
+def bootstrap_mean(values: Array) -> Estimate:
     """Mean of one value for each unit, see :func:`bootstrap`."""
-    return bootstrap(np.mean, values, **options)
+    return bootstrap(np.mean, values)
 
 
-def bootstrap_ratio(ours: Array, theirs: Array, **options: int) -> Estimate:
+def bootstrap_ratio(ours: Array, theirs: Array) -> Estimate:
     """``mean(ours) / mean(theirs)`` over pairs of values of at least 0, see :func:`bootstrap`."""
 
     def ratio(a: Array, b: Array, axis: int) -> Array:
         return a.mean(axis) / np.maximum(b.mean(axis), np.finfo(float).tiny)
 
-    return bootstrap(ratio, ours, theirs, **options)
+    return bootstrap(ratio, ours, theirs)
 
 
 def estimate(trials: DataFrame, column: str) -> Estimate | None:

@@ -40,9 +40,9 @@ _MEANINGS = {
 }
 
 
-def by_controller(trials: DataFrame, kind: str = "turn") -> dict[str, DataFrame]:
-    """Trials of one kind, of each controller that has any."""
-    found = {name: select(trials, controller=name, kind=kind) for name in CONTROLLERS}
+def by_controller(trials: DataFrame) -> dict[str, DataFrame]:
+    """The turns of each controller that has any."""
+    found = {name: select(trials, controller=name, kind="turn") for name in CONTROLLERS}
     return {name: mine for name, mine in found.items() if len(mine)}
 
 
@@ -86,6 +86,7 @@ def group_table(trials: DataFrame, by: str, what: str) -> Table:
     """
     names, rows = list(by_controller(trials)), []
     turns = trials[trials["kind"] == "turn"]
+    tested = trials["seed"].nunique() >= LEAST_SEEDS
     groups = {
         f"{key:g}" if isinstance(key, float) else str(key): mine
         for key, mine in turns.groupby(by, sort=False)
@@ -94,11 +95,11 @@ def group_table(trials: DataFrame, by: str, what: str) -> Table:
         found = by_controller(mine)
         errors = [stats.estimate(found[name], "error_deg") if name in found else None for name in names]
         ends = (f"{name} {of['lost'].sum()}, {of['not_reached'].sum()}" for name, of in found.items())
-        compared = ratio_and_p(*paired(mine, "E-KM", "KM", "error_deg"), mine["seed"].nunique())
-        rows.append([key, *errors, *compared, "; ".join(ends)])
+        compared = ratio_and_p(*paired(mine, "E-KM", "KM"), mine["seed"].nunique())
+        rows.append([key, *errors, *compared[: 1 + tested], "; ".join(ends)])
     columns = [
         by.replace("_deg", " [deg]"), *(f"{name} [deg]" for name in names),
-        Column("E-KM:KM [%]", ".0f", percent=True), Column("p paired", ".1g"),
+        Column("E-KM:KM [%]", ".0f", percent=True), *([Column("p paired", ".1g")] if tested else []),
         "lost, not reached",
     ]  # fmt: skip
     note = (
@@ -126,10 +127,10 @@ def reason_table(trials: DataFrame) -> Table:
     return Table("stop_reasons", "Why the turns ended", columns, rows, note)
 
 
-def paired(trials: DataFrame, ours: str, theirs: str, column: str, kind: str = "turn") -> tuple[Array, Array]:
-    """Unit means of two controllers over trials of one kind, for the units that both have."""
-    mine, others = (select(trials, controller=name, kind=kind) for name in (ours, theirs))
-    return stats.paired_means(mine, others, column)
+def paired(trials: DataFrame, ours: str, theirs: str) -> tuple[Array, Array]:
+    """Unit means of the steady-state errors of two controllers, for the units that both have."""
+    mine, others = (select(trials, controller=name, kind="turn") for name in (ours, theirs))
+    return stats.paired_means(mine, others, "error_deg")
 
 
 def ratio_and_p(ours: Array, theirs: Array, n_seeds: int) -> tuple[Estimate | None, float | None]:
@@ -202,10 +203,10 @@ def verdict(trials: DataFrame, seeds: Sequence[int]) -> str:
             parts.append(f"The {order[0]}: {why(turns[order[0]])}")
     ours, theirs = prediction_means(trials)
     if len(ours):
-        wrong = f"{stats.bootstrap_mean(ours):.2f} deg, the KM by {stats.bootstrap_mean(theirs):.2f} deg"
-        parts.append(f"One motion ahead the E-KM is wrong by {wrong} on the same motions.")
+        wrong = f"{stats.bootstrap_mean(ours):.2f} deg, the KM to {stats.bootstrap_mean(theirs):.2f} deg"
+        parts.append(f"The E-KM predicts one motion to {wrong} on the same motions.")
     if len(seeds) >= LEAST_SEEDS and order[:1] == ["E-KM"]:
-        found = {name: ratio_and_p(*paired(trials, "E-KM", name, "error_deg"), 0)[0] for name in order[1:]}
+        found = {name: ratio_and_p(*paired(trials, "E-KM", name), 0)[0] for name in order[1:]}
         ratios = [f"{name} {100 * ratio:.0f} %" for name, ratio in found.items() if ratio is not None]
         if ratios:
             parts.append(f"Error of the E-KM over that of {', '.join(ratios)} (paired).")
@@ -224,7 +225,7 @@ def why(turns: DataFrame) -> str:
 
 def which_seeds(seeds: Sequence[int]) -> str:
     """How many, and what may be concluded from them."""
-    few = f" Fewer than {LEAST_SEEDS} seeds: no verdict." if len(seeds) < LEAST_SEEDS else ""
+    few = f" Fewer than {LEAST_SEEDS} seeds: differences are not tested." if len(seeds) < LEAST_SEEDS else ""
     development = min(seeds) < FIRST_REPORTED
     tuned = " Development seeds: figures may have been tuned on them." if development else ""
     which = f"Seed {seeds[0]}." if len(seeds) == 1 else f"Seeds {seeds[0]} to {seeds[-1]}."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .calibrate import calibrate
-from .motions import Recording
-from .result import Calibrated, Calibration
+from .parameters import Calibrated, Calibration
+from .residuals import Recording
 
 __all__ = ["Calibrated", "Calibration", "Recording", "calibrate"]

@@ -11,10 +11,8 @@ from ..._extras import require
 from ...exceptions import GraspError, StateError
 from ...typing import Array
 from ..kinematic_model import KinematicModel
-from .motions import Recording, rests
-from .parameters import Unknowns
-from .residuals import GROUPS, Evidence, Residuals
-from .result import Calibration
+from .parameters import Calibration, Unknowns
+from .residuals import GROUPS, Evidence, Recording, Residuals, rests
 
 _SMALLEST_NOISE = 1e-3  # of the standard deviations at the start: below, the model's own error is left
 _UNSENSED = 0.5  # of the force problem's standard deviations, where no sensor measures their scale
@@ -132,7 +130,7 @@ class _Problem:
         """Standard deviation of each kind of residual; those of motions by the median, since contacts slip.
 
         Rows that no parameter moves (out of a planar hand's plane) say nothing. The parameters take their
-        share of the freedom, as far as the data and not the priors tell them.
+        share of the freedom, as far as the data and not the priors determine them.
         """
         at, sensors = self.at(x), self.evidence.sensors
         moved = np.abs(at.jacobian).max(axis=1) > 1e-9

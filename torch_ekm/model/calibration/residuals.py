@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,12 +13,53 @@ from numpy.typing import NDArray
 
 from ..._noise import NOISE
 from ...exceptions import GraspError
-from ...kinematics.play import Play
-from ...typing import Array, Tensor
+from ...kinematics.grasp_state import GraspState
+from ...kinematics.servo_model import Play
+from ...typing import Array, Float, Tensor
 from ..kinematic_model import KinematicModel
 from ..linearization import Linearization
-from .motions import Rest
 from .parameters import Figures, Unknowns
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """``torch_ekm.plant.Trajectory``, or anything with observations in the order of time.
+
+    Of each observation: ``state``, ``a`` (encoders [rad]), ``fingertip_force`` [N] (NaN, or None as a whole,
+    where there is no sensor) and ``status``; what is not "held" ends a grasp.
+    """
+
+    @property
+    def observations(self) -> Sequence[Any]: ...
+
+
+@dataclass(frozen=True)
+class Rest:
+    """A state in which hand and object rest, with encoders [rad] and fingertip forces [N]."""
+
+    state: GraspState
+    a: Float[Tensor, " n_a"]
+    force: Float[Tensor, " n_pads"] | None
+
+
+def rests(recordings: Iterable[Recording]) -> list[list[Rest]]:
+    """The states of each grasp, in order; a state in which the object is not held or not seen ends one."""
+    grasps: list[list[Rest]] = []
+    for recording in recordings:
+        grasp: list[Rest] = []
+        for seen in recording.observations:
+            if getattr(seen.status, "value", seen.status) != "held":
+                grasps.append(grasp)
+                grasp = []
+                continue
+            force = None if seen.fingertip_force is None else seen.fingertip_force.double()
+            if force is not None and not bool(torch.isfinite(force).any()):
+                force = None
+            state = GraspState(*(part.double() for part in (seen.q, seen.position, seen.rotation)))
+            grasp.append(Rest(state, seen.a.double(), force))
+        grasps.append(grasp)
+    return [grasp for grasp in grasps if len(grasp) > 1]
+
 
 GROUPS = {
     "joints": NOISE.joint,
@@ -61,7 +103,7 @@ class Evidence:
 
     Args:
         model: of the hand as described.
-        grasps: from :func:`~torch_ekm.model.calibration.motions.rests`.
+        grasps: from :func:`~torch_ekm.model.calibration.residuals.rests`.
         unknowns: what x means.
     """
 

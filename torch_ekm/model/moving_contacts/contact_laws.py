@@ -108,7 +108,7 @@ class StepSolution(NamedTuple):
             rates[rows] = _RHO_NEWTON * np.outer(self.t[i] / self.lam[i], gap[i])
         try:
             change = np.linalg.solve(self.jacobian, -rates)
-        except np.linalg.LinAlgError:  # forces that no motion tells apart: the least of their changes
+        except np.linalg.LinAlgError:  # forces that no motion distinguishes: the least of their changes
             change = np.linalg.lstsq(self.jacobian, -rates, rcond=None)[0]
         change = np.asarray(change, dtype=np.float64)
         z, lam, t = np.split(change, [n_z, n_z + m])

@@ -18,9 +18,8 @@ from ...kinematics.grasp_state import GraspState
 from ...kinematics.se3 import exp
 from ...typing import Array, Float, Tensor
 from .contact_laws import Response, StepSolution, solve
-from .mode_linearization import mode_linearization
 from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
-from .step_program import HandLaws, StepProgram, Way
+from .step_program import HandLaws, StepProgram, Way, mode_linearization
 
 if TYPE_CHECKING:
     from ..linearization import Linearization
@@ -367,10 +366,10 @@ class ContactMotion:
         )
 
     def _place(self, state: GraspState) -> PlacedGrasp:
-        model, detector = self.model, self.model.detector
+        model, detector = self.model, self.model.touch_detector
         poses = model.kinematics(state.q)
         if isinstance(detector, ContactDetector):
-            contacts = detector.near(poses, state.position, state.rotation, NEAR)
+            contacts = detector.near(poses, state.position, state.rotation, NEAR, self.loads.force)
         else:
             contacts = detector(state.q, state.position, state.rotation)
         return PlacedGrasp(model, state, contacts, poses, self._springs)

@@ -8,19 +8,22 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ..._arrays import in_numpy
-from ...contact.contact_kinematics import ContactKinematics, full_grasp_matrix, full_hand_jacobian
-from ...contact.contact_model import ContactModel
+from ...contact.contact_kinematics import (
+    ContactKinematics,
+    ContactModel,
+    full_grasp_matrix,
+    full_hand_jacobian,
+)
 from ...contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet, Detector
 from ...description.hand import HandDescription
 from ...kinematics.grasp_state import GraspState
-from ...kinematics.link_poses import Kinematics, LinkPoses
+from ...kinematics.hand_kinematics import Kinematics, LinkPoses
 from ...kinematics.se3 import hat
 from ...typing import AnyArray, Array, Tensor
 from ..arms import arms_at, bends
 from ..linearization import FollowedFigures
 from ..options import ModelOptions
-from ..reduction import Reduction
-from ..sensitivity import normal_motion
+from ..reduction import Reduction, normal_motion
 
 L = CHARACTERISTIC_LENGTH
 _LENGTHS = np.array([L, L, L, 1.0, 1.0, 1.0])[:, None]
@@ -34,10 +37,12 @@ class GraspModel(Protocol):
     hand: HandDescription
     options: ModelOptions
     kinematics: Kinematics
-    detector: Detector
     reduction: Reduction
     spring_rest: Tensor
     figures: FollowedFigures | None
+
+    @property
+    def touch_detector(self) -> Detector: ...
 
     def contact_kinematics(
         self, state: GraspState, contacts: ContactSet, *, poses: LinkPoses | None = None
@@ -85,7 +90,7 @@ class PlacedGrasp:
         self._model = model
         kin, S = self.kin, model.reduction.scaled_basis.numpy()
         A = np.concatenate([full_hand_jacobian(kin), -full_grasp_matrix(kin).mT], axis=-1) @ S
-        A = A.reshape(contacts.n_c, 6, -1) / _LENGTHS
+        A = A.reshape(contacts.n_c, 6, S.shape[1]) / _LENGTHS
         self.normal_rate = A[:, 0]  # how fast the finger nears the object
         mu_s, gamma, self.frame = (np.asarray(x) for x in (near.friction, near.torsional_friction, kin.frame))
         # where a contact slides, its point moves over the object by M K_f v and over the finger by -M K_o v

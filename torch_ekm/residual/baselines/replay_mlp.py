@@ -85,7 +85,7 @@ class ReplayMLP(ScaledLearner, SingleLearner):
         return mean, self.noise.expand_as(mean)
 
     def unit_draws(self, x: Tensor, n: int, generator: torch.Generator | None) -> Tensor:
-        """Members' functions, mixed; one network knows of each query alone."""
+        """Members' functions, mixed; one network takes each query alone."""
         if self.members == 1 or not self.count:
             return super().unit_draws(x, n, generator)
         apart = self._members(self._inputs(x))

@@ -22,7 +22,7 @@ class TrackStatus(Enum):
     PALM_HIDDEN = "palm_hidden"  # too few markers of the palm's board were found
     OBJECT_HIDDEN = "object_hidden"  # too few markers of the object's board were found
     AMBIGUOUS = "ambiguous"  # two mirrored poses fit, and no earlier frame decides which
-    JUMP = "jump"  # the pose is too far from the last one; believed when seen repeatedly
+    JUMP = "jump"  # the pose is too far from the last one; accepted when seen repeatedly
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from .track import Track, TrackStatus
 
 _MAX_STEP, _MAX_TURN = 0.020, float(np.radians(20.0))  # believable between two frames [m], [rad]
 _MIN_MARKERS = 2  # of a board that must be seen: one alone is prone to flips
-_JUMP_FRAMES = 3  # a jump is believed when that many frames in a row agree on it
+_JUMP_FRAMES = 3  # a jump is accepted when that many frames in a row agree on it
 
 
 class MarkerTracker:

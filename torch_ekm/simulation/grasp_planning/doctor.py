@@ -17,7 +17,7 @@ from ..mechanism.assembly import chain, make_transmission, true_object
 from ..parameters import PlantParameters
 from .blame import BorneProblem, motor_text
 from .pinch import across_axis, descend, minimise, pinch_problem, solve
-from .pinch_problem import PinchProblem, PinchRequest
+from .pinch_problem import PinchGeometry, PinchProblem, PinchRequest
 
 _MOST = 1.6  # largest change: the log of a factor, or [rad]
 _WIDEST = 2.5  # [rad] by which a limit or a range is moved at first
@@ -31,7 +31,7 @@ _STEPS = 60  # of a descent
 _FIRST = ("force", "width")  # their decrease is tried whatever the slope says
 _LIKELY = ("range", "all springs")  # so is what lowers the cost of these
 _CENTRED = "fingertips centred on the object (spread = 0), as it is otherwise"
-_TOLD = 3  # changes that are told
+_SHOWN = 3  # changes that are shown
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ class Cure(NamedTuple):
 
     changes: list[str]
     """The smallest first; none: nothing was found in time."""
-    q: Array
-    """The posture that a hand has whose joints bear any load ``(n_q,)`` [rad]."""
+    failed: PinchGeometry
+    """The one pinch that a hand has whose joints bear any load."""
 
 
 def smallest_changes(
@@ -101,12 +101,12 @@ def smallest_changes(
     request = PinchRequest(hand.pinch_force if config.pinch_force is None else config.pinch_force)
     reach = solve(BorneProblem(problem), request)
     case = Case(hand, obj, request, parameters, problem if reach.holds else BorneProblem(problem))
-    q = problem.geometry(reach.x[None]).q[0]
+    failed = problem.geometry(reach.x[None])
     starts = [reach.x]
     if not case.borne:
         best = solve(problem, request)
         if best.holds and across_axis(problem, best):
-            return Cure([_CENTRED], q)
+            return Cure([_CENTRED], failed)
         starts.append(best.x)
     held: list[tuple[float, int, Change, Array]] = []
     for n, change in enumerate(_steepest(case, starts)):
@@ -114,10 +114,10 @@ def smallest_changes(
             break
         if (found := _with(case, change, starts)) is not None:
             held.append((abs(found[0]), n, change, found[1]))
-    told: dict[str, str] = {}
+    shown: dict[str, str] = {}
     least: list[tuple[float, str]] = []
     for size, _, change, x in sorted(held, key=lambda one: one[:2]):
-        if change.kind in told or len(told) == _TOLD:
+        if change.kind in shown or len(shown) == _SHOWN:
             continue
         low, high = 0.0, size
         for _ in range(_FINER):
@@ -125,9 +125,9 @@ def smallest_changes(
             found = None if time.process_time() > end else _held(change.of(change.side * middle), x)
             low, high, x = (middle, high, x) if found is None else (low, middle, found)
         far = " (as far as geometry goes)" if case.borne else ""
-        told[change.kind] = change.text(change.side * high) + far
-        least.append((high, told[change.kind]))
-    return Cure([text for _, text in sorted(least)], q)
+        shown[change.kind] = change.text(change.side * high) + far
+        least.append((high, shown[change.kind]))
+    return Cure([text for _, text in sorted(least)], failed)
 
 
 def _with(case: Case, change: Change, starts: list[Array]) -> tuple[float, Array] | None:

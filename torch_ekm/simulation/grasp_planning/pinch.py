@@ -15,7 +15,7 @@ from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import EquilibriumError, ParameterError
 from ...kinematics import HandKinematics
-from ...kinematics.null_space import null_space
+from ...kinematics.tensors import null_space
 from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import chain, make_transmission, true_object
@@ -237,7 +237,8 @@ def opposing_pads(hand: HandDescription, config: PlantConfig) -> tuple[str, tupl
     """Names of the pad that opposes the others, and of these."""
     names = [pad.name for pad in hand.pads]
     thumb = config.thumb or next((name for name in names if name.startswith("thumb")), None)
-    fingers = config.fingers or tuple(name for name in names if name.startswith(("index", "middle")))
+    both = tuple(name for name in names if name.startswith(("index", "middle")))
+    fingers = config.fingers or (both if len(both) >= min(2, len(names) - 1) else ())
     if thumb is None or not fingers:
         thumb, others = _most_opposed(hand, names, thumb)
         fingers = tuple(name for name in fingers or others if name != thumb)

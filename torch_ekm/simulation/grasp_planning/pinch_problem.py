@@ -14,8 +14,8 @@ from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics
 from ...kinematics.equilibrium import FreeHand
-from ...kinematics.null_space import null_space
 from ...kinematics.se3 import exp
+from ...kinematics.tensors import null_space
 from ...typing import Array
 from ..mechanism.assembly import chain
 from ..mechanism.transmission import Transmission

@@ -58,7 +58,7 @@ class SimulatedCamera:
     """Draws cards by their homography ``x ~ K [r1 r2 t] X``, then bodies, blur and noise.
 
     Cards are sampled 16 times in each pixel and hidden by the bodies before them and
-    by nearer cards; the scene knows the true poses, the picture is all that a tracker gets.
+    by nearer cards; the scene has the true poses, a tracker gets the picture alone.
 
     Args:
         camera: the lens, without distortion.

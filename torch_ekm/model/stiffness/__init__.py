@@ -1,1 +1,0 @@
-"""Stiffness D: springs, weights, and the geometry of constant forces."""
