@@ -20,14 +20,11 @@ from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
-from .sparse_gp.engine import numba_descent as steps
-from .sparse_gp.engine.numba_math import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
+from .sparse_gp.engine.numba_descent import descend_fleet as descend_fleet
+from .sparse_gp.engine.numba_memory import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
 from .sparse_gp.engine.numba_rebuild import rebuild_fleet as rebuild_fleet
-from .sparse_gp.engine.numba_units import pool_columns as pool_columns
 
 embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
-lead_fleet, arrive_fleet, descend_fleet = steps.lead_fleet, steps.arrive_fleet, steps.descend_fleet
-predict_queries, finish_step = steps.predict_queries, steps.finish_step
 
 
 @njit(types.void(I1, A3, I2, A2), **INNER)
@@ -65,25 +62,20 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
         return -1
     B, d, m, n_learners = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
     far, p, inside = np.empty(g[G.N_EXPERTS]), np.empty(g[G.N_EXPERTS]), np.empty(m)
-    mean, noise, t, found = np.empty(m), np.empty(m), np.empty(m), np.empty(4)
+    mean, noise, found = np.empty(m), np.empty(m), np.empty(4)
     means, noisy, local = np.empty((B * m, n_learners)), np.empty((B * m, n_learners)), np.empty(B * m)
     figures, errors = np.zeros((n_learners + 1, 4, B)), np.zeros((n_learners + 1, B, m))
     events, judged_on = np.zeros((n_learners + 1, B), np.int64), np.empty(B, np.bool_)
     figures[:, 2] = 1.0  # the weight where there is no sample
-    total = 0
-    for i in range(n_learners + 1):
-        total += B * (members[i, P.VALUES] + members[i, P.WIDTH] + 2 * members[i, P.SLOTS] + 1)
-    room, at, alarm = np.empty(total), 0, 0  # what is found for predictions serves the update
+    alarm = 0
     gp.grow_largest(g, on, y)
     for i in range(n_learners + 1):
         a = members[i]
-        n, W, M = a[P.VALUES], a[P.WIDTH], a[P.SLOTS]
-        psi, phi = np.empty(M), np.empty(M)
+        psi, phi = np.empty(a[P.SLOTS]), np.empty(a[P.SLOTS])
         for b in range(B):
-            values, q = room[at : at + n], room[at + n : at + n + W]
-            k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
-            prior = gp.look(a, b, vector_at(x, b, d), values, q, k, psi, phi)
-            v = gp.mean_and_variance(a, b, prior, k, Ck, mean)
+            values, q, k, Ck, prior = gp.room_of(a, b)  # what is found for predictions serves the update
+            prior[0] = gp.look(a, b, vector_at(x, b, d), values, q, k, psi, phi)
+            v = gp.mean_and_variance(a, b, prior[0], k, Ck, mean)
             gp.cut(a, b, mean, inside)
             if i == n_learners:
                 for o in range(m):
@@ -94,8 +86,6 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
                 for o in range(m):
                     means[b * m + o, i] = mean[o]
                     noisy[b * m + o, i] = v * scale[o] * scale[o] + noise[o]
-            room[at + n + W + 2 * M] = prior
-            at += n + W + 2 * M + 1
     for b in range(B):
         count, nis = vector_at(g[G.COUNT], b, 1), 0.0
         judged = on[b] and count[0] >= E.YOUNG
@@ -110,25 +100,17 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
         if on[b]:
             count[0] += 1.0
         of_all[0, b] = nis
-    at = 0
     for i in range(n_learners + 1):
         a, learned, on_ = members[i], y, on
         if i == n_learners:
             learned, on_ = local.ctypes.data, judged_on
             if not alarm >> n_learners & 1:
                 break
-        n, W, M = a[P.VALUES], a[P.WIDTH], a[P.SLOTS]
         for b in range(B):
-            values, q = room[at : at + n], room[at + n : at + n + W]
-            k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
             if on_[b]:
-                prior = room[at + n + W + 2 * M]
-                events[i, b] = gp.learn(
-                    a, b, values, q, k, Ck, prior, vector_at(learned, b, m), t, found, errors[i, b]
-                )
+                events[i, b] = gp.learn(a, b, vector_at(learned, b, m), found, errors[i, b])
                 for r in range(4):
                     figures[i, r, b] = found[r]
-            at += n + W + 2 * M + 1
         if gp.note(a, numbers[i], on_, x, learned, figures[i], errors[i]):
             alarm |= 1 << i
     _of_all(g, figures, events, of_all)

@@ -19,6 +19,7 @@ from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import RobustWeight
 from .part import Host, Part
 from .prequential_loss import PrequentialLoss, Queries
+from .units import Standardize
 
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
 BETAS = 0.9, 0.99  # of Adam
@@ -28,6 +29,7 @@ NETWORK_RATE = 0.015
 # features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
 NETWORK_DECAY = 0.25
 LEAST, LEAST_NOISE, MOST = -7.0, -14.0, 7.0  # of logarithms: far beyond what standardised data can mean
+PARTS = 0.25, 0.75, 1.0  #: of its samples after which the parts of a step end
 _SHORT = 8  # samples between two rebuilds from which on a step leaves the last one out
 
 
@@ -71,7 +73,7 @@ class LearnHyperparameters(Part):
         self.steps, self.memory = check_count("steps", steps), check_count("memory", memory, least=0)
 
     def bind(self, learner: Host) -> None:
-        """A window, a copy of the state, Adam's moments and a memory."""
+        """A window, a copy of the state and of the parameters, Adam's moments and a memory."""
         if self.memory and learner.part(ProcessNoise) is not None:
             valid = "0 with ProcessNoise: the past is that of another g"
             raise ParameterError("memory of LearnHyperparameters", self.memory, valid)
@@ -83,16 +85,18 @@ class LearnHyperparameters(Part):
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
-        parameters = [*learner.kernel.hyperparameters().values(), learner.log_noise_variance]
-        self.adam = Adam(parameters, betas=BETAS)
-        for i, p in enumerate(parameters):
-            self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
+        # where steps lead to; kernel and noise follow at the next rebuild: until then the caches are theirs
+        self.kernel = copy.deepcopy(learner.kernel).requires_grad_(False)
+        self.log_noise = nn.Buffer(learner.log_noise_variance.detach().clone())
+        self.adam = Adam(self.ahead().values(), betas=BETAS)
         # no more than what a learner remembers that forgets
         known = self.memory if factor == 1.0 else min(self.memory, math.ceil(1.0 / (1.0 - factor)))
         size = max(self.window + self.lead, known, learner.recent.capacity)
         fleet = {"batch_shape": fleet, "dtype": like.dtype, "device": like.device}
         learner.recent = Recent(learner.in_features, learner.out_features, size, **fleet)
-        self._n_rebuilt, self._n_changes, self._leads = 0, 0, False
+        self._leads = False
+        #: samples that the past state has seen; changes of it, and of where steps begin
+        self.since = 0, 0
 
     def act(self, learner: Host) -> None:
         """Descend, and move the parameters, when it is time."""
@@ -100,12 +104,13 @@ class LearnHyperparameters(Part):
         if self._is_due(learner, n):
             self.descend(learner)
         elif learner.engine is not None and self.lead and self.memory:
-            for ahead in (1, 2):  # a large step in parts
+            for ahead in range(1, len(PARTS)):  # a large step in parts
                 if self._is_due(learner, n + ahead):
-                    since = self._n_rebuilt, self._n_changes, self._leads
-                    learner.engine.descend(learner, n + ahead - self.lead, since, until=3 - ahead)
-        if learner.is_due(n):
-            self._move(learner)
+                    learner.engine.descend(learner, self, n + ahead - self.lead, PARTS[-1 - ahead])
+        if self._leads and learner.is_due(n):
+            for p, ahead in zip(self.theta(learner).values(), self.ahead().values(), strict=True):
+                p.copy_(ahead)
+            self._leads = False
 
     def _is_due(self, learner: Host, n: int) -> bool:
         """Whether there is a step after n samples."""
@@ -117,38 +122,39 @@ class LearnHyperparameters(Part):
     def after_rebuild(self, learner: Host) -> None:
         """The present state becomes the past one, which has seen all samples so far."""
         self.loss.snapshot(learner.posterior)
-        self._n_rebuilt = learner.n_samples
-        self._n_changes += 1
+        units = learner.part(Standardize)  # new ones while they are rough: steps still lead where they led
+        self._begin(learner.n_samples, self._leads and units is not None and units.is_rough(learner))
+
+    def _begin(self, n_rebuilt: int, leads: bool = False) -> None:
+        self.since, self._leads = (n_rebuilt, self.since[1] + 1), leads
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models face another system: the state of the old one does not count."""
         self.loss.state.forget(models)
-        self._n_changes += 1
+        self._begin(self.since[0], self._leads)
 
     def reset(self) -> None:
         """Forget snapshot and step sizes."""
-        super().reset()
+        self.n_steps.zero_()
         self.adam.reset()
         self.loss.state.reset()
-        self._n_rebuilt, self._leads = 0, False
-        self._n_changes += 1
+        self._begin(0)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Samples that the past state has seen, and whether steps lead away from it."""
-        return {"n_rebuilt": self._n_rebuilt, "leads": self._leads}
+        return {"n_rebuilt": self.since[0], "leads": self._leads}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._n_rebuilt, self._leads = int(state["n_rebuilt"]), bool(state["leads"])
-        self._n_changes += 1
+        self._begin(int(state["n_rebuilt"]), bool(state["leads"]))
 
     def queries(self, learner: Host, n: int) -> Queries:
         """Of n samples those since the past state, and this turn's part of those that it has seen."""
         recent = learner.recent
-        x, y, _, weight = recent.last(n, min(max(n - self._n_rebuilt, 0), self.window))
+        x, y, _, weight = recent.last(n, min(max(n - self.since[0], 0), self.window))
         absorbed = age = x.new_zeros(x.shape[-2])
         if self.memory:
             x_past, y_past, weight_past, age_past = recent.take(n, self.replayed(learner))
-            seen = (age_past > n - self._n_rebuilt).to(age_past.dtype)
+            seen = (age_past > n - self.since[0]).to(age_past.dtype)
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
             seen = seen * (age_past < recent.capacity)  # the oldest one's place may be taken
             weight = torch.cat([weight, weight_past * seen], dim=-1)
@@ -159,69 +165,50 @@ class LearnHyperparameters(Part):
         """Samples of the memory in a step."""
         return max(_REPLAYED * self.window, learner.posterior.capacity) if self.memory else 0
 
-    def figures(self) -> tuple[float, float, float]:
-        """Rate of a step; square of a robust weight's threshold (0: none), factor of forgetting."""
-        return self.rate, (self.loss.robust or 0.0) ** 2, self.loss.forgetting_factor
-
     def theta(self, learner: Host) -> dict[str, Tensor]:
         """What is learned, by name."""
         return {**learner.kernel.hyperparameters(), "log_noise": learner.log_noise_variance}
 
-    def descend(self, learner: Host) -> None:
-        """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.
+    def ahead(self) -> dict[str, Tensor]:
+        """Where steps lead to, by name."""
+        return {**self.kernel.hyperparameters(), "log_noise": self.log_noise}
 
-        It starts where the last ones lead. The parameters move at the next rebuild: until then the caches
-        are those of the old ones.
-        """
-        n, since = learner.n_samples + 1 - self.lead, (self._n_rebuilt, self._n_changes, self._leads)
-        if learner.engine is None or not learner.engine.descend(learner, n, since):
+    def start(self, learner: Host) -> bool:
+        """Before a step: it starts where the last ones lead. Whether they lead away from the caches."""
+        if not self._leads:
+            for ahead, p in zip(self.ahead().values(), self.theta(learner).values(), strict=True):
+                ahead.copy_(p)
+        return self._leads
+
+    def descend(self, learner: Host) -> None:
+        """A step of Adam on the loss, model by model; without samples or a finite gradient it stays."""
+        n = learner.n_samples + 1 - self.lead
+        if learner.engine is None or not learner.engine.descend(learner, self, n, PARTS[-1]):
             self._descend(learner, n)
-        self._leads = True
+        self._begin(self.since[0], True)
 
     def _descend(self, learner: Host, n: int) -> None:
-        kernel, log_noise = learner.kernel, learner.log_noise_variance.clone()
-        if self._leads:  # another thread may query the kernel itself
-            kernel = copy.deepcopy(kernel)
-        parameters = {**kernel.hyperparameters(), "log_noise": log_noise}
-        if self._leads:
-            self._add(parameters)
-        queries = self.queries(learner, n)
-        _, gradients = self.loss.with_gradients(kernel, log_noise, queries, anew=self._leads)
+        anew, queries = self.start(learner), self.queries(learner, n)
+        kernel, log_noise = copy.deepcopy(self.kernel), self.log_noise.clone()
+        parameters = [p.requires_grad_(True) for p in (*kernel.hyperparameters().values(), log_noise)]
+        with torch.enable_grad():
+            loss = self.loss(kernel, log_noise, queries, anew=anew).sum()
+            gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         on = ((queries.weight * (1.0 - queries.absorbed)).sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
         n_steps = self.n_steps.clamp_min(1.0)
         correction, decay = self.adam.correction(n_steps) * _shrink(n_steps), NETWORK_DECAY * _shrink(n_steps)
-        decay = decay * on * log_noise.mean(-1).exp().clamp_max(1.0)
-        for i, ((name, p), gradient) in enumerate(zip(parameters.items(), gradients, strict=True)):
+        decay = decay * on * self.log_noise.mean(-1).exp().clamp_max(1.0)
+        for i, ((name, p), gradient) in enumerate(zip(self.ahead().items(), gradients, strict=True)):
             if gradient is None:
                 continue
-            shared, move = self.shared_kernel and name != "log_noise", self.get_buffer(f"move_{i}")
+            shared, logarithm = self.shared_kernel and name != "log_noise", is_logarithm(name)
             good = gradient.isfinite() & (_spread(on, p, shared) > 0)
-            rate = self.rate if is_logarithm(name) else NETWORK_RATE
-            if not is_logarithm(name):
-                move.sub_(_spread(decay, p, shared) * p)
-            step = rate * _spread(correction, p, shared)
-            self.adam.move(i, move, gradient.where(good, 0.0), step, good)
-
-    def moments(self, i: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Of the i-th parameter: its move at the next rebuild, and Adam's first and second moments."""
-        first, second = (self.adam.get_buffer(f"{name}_{i}") for name in ("first", "second"))
-        return self.get_buffer(f"move_{i}"), first, second
-
-    def _move(self, learner: Host) -> None:
-        """The parameters as the steps since the last rebuild want them."""
-        self._leads = False
-        if learner.engine is not None and learner.engine.arrive(learner):
-            return
-        self._add(self.theta(learner))
-        for i in range(len(self.theta(learner))):
-            self.get_buffer(f"move_{i}").zero_()
-
-    def _add(self, parameters: dict[str, Tensor]) -> None:
-        """The moves, in place."""
-        for i, (name, p) in enumerate(parameters.items()):
-            p.add_(self.get_buffer(f"move_{i}"))
-            if is_logarithm(name):
+            if not logarithm:
+                p.sub_(_spread(decay, p, shared) * p)
+            step = (self.rate if logarithm else NETWORK_RATE) * _spread(correction, p, shared)
+            self.adam.move(i, p, gradient.where(good, 0.0), step, good)
+            if logarithm:
                 p.clamp_(LEAST_NOISE if name == "log_noise" else LEAST, MOST)
 
 

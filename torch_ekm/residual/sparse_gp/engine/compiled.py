@@ -14,11 +14,11 @@ from ....exceptions import SpeedWarning
 from ....typing import Tensor
 from ...report import MomentsWithJacobians, UpdateReport
 from .. import plan as P
+from ..hyperparameters import PARTS, LearnHyperparameters
 from ..part import Host
 from .binding import Bound, Plan
 from .loading import load_loops
 
-_ALL = 3  # parts of a step
 _LEFT = "{} learns by torch, which takes several times as long as compiled loops: {}"
 
 
@@ -107,60 +107,30 @@ class CompiledEngine:
             loops.rebuild_fleet(plan.row, plan.share)
         return plan is not None
 
-    def descend(self, gp: Host, n: int, since: tuple[int, int, bool], *, until: int = _ALL) -> bool:
-        """A step on the loss of LearnHyperparameters, after n samples; False: torch must do it.
+    def descend(self, gp: Host, learning: LearnHyperparameters, n: int, end: float) -> bool:
+        """A step on the loss, after n samples, up to this share of what it predicts; False: torch must do it.
 
-        Args:
-            since: samples up to the past state, changes of it so far, whether steps lead away from it.
-            until: of one model the work may come in parts: the past state's caches, what it predicts, the
-                gradient and the step. Those up to this one are done, if they are not yet.
+        Only that of one model comes in parts. They are the same, and so is their sum, whenever they come.
         """
-        plan, recent = self._free(gp), gp.recent
+        plan = self._free(gp)
         # the gradient of one kernel for all models is a sum
         if plan is None or not (plan.row[P.OWN] or len(plan.all) == 1):
             return False
-        if until < _ALL and len(plan.all) > 1:
-            return True
         loops: Any = load_loops()
-        done, found = plan.begun[1:] if plan.begun[:1] == ((n, *since),) else (0, None)
-        n_rebuilt, _, leads = since
-        if done < 1:
-            loops.lead_fleet(plan.past)
-            if leads:
+        if end == PARTS[-1] or len(plan.all) == 1:
+            step = n, learning.since
+            begin = plan.begun[1] if plan.begun[0] == step else 0.0
+            if begin == 0.0:
+                leads = learning.start(gp)
                 loops.embed_fleet(plan.past)
-                loops.rebuild_fleet(plan.past, 0.0)
-        if until > 1 and len(plan.all) > 1:
-            loops.descend_fleet(plan.past, n, n_rebuilt, recent.n_taken)
-        elif until > 1:
-            if found is None:
-                found = loops.predict_queries(plan.past, n, n_rebuilt, recent.n_taken)
-            if until == _ALL:
-                loops.finish_step(plan.past, n, n_rebuilt, found)
-        recent.n_taken += until == _ALL
-        plan.begun = () if until == _ALL else ((n, *since), 1, found)
-        return True
-
-    def arrive(self, gp: Host) -> bool:
-        """The parameters move to where steps lead; False: torch must do it."""
-        plan = self._free(gp)
-        if plan is None or not (plan.row[P.OWN] or len(plan.all) == 1):
-            return False
-        loops: Any = load_loops()
-        loops.lead_fleet(plan.past)
-        loops.arrive_fleet(plan.past)
-        loops.embed_fleet(plan.row)
-        return True
-
-    def pool(self, gp: Host, x: Tensor, y: Tensor, on: Tensor) -> bool:
-        """A block into the units, see ``Units.pool``; False: torch must do it."""
-        if self._free(gp) is None:
-            return False
-        loops: Any = load_loops()
-        for scale, block in ((gp.units.input, x), (gp.units.output, y)):
-            pooled = scale.shifted, scale.weight, scale.centre, scale.spread, scale.large
-            sizes = gp.batch_shape.numel(), *block.shape[-2:], float(scale.memory)
-            tensors = [t.contiguous() for t in (block, on)] + [*pooled]
-            loops.pool_columns(*sizes, *(t.data_ptr() for t in tensors))
+                if leads:
+                    loops.rebuild_fleet(plan.past, 0.0)
+            for until in PARTS if len(plan.all) == 1 else PARTS[-1:]:
+                if begin < until <= end:
+                    loops.descend_fleet(plan.past, n, learning.since[0], gp.recent.n_taken, begin, until)
+                    begin = until
+            gp.recent.n_taken += end == PARTS[-1]
+            plan.begun = step, end
         return True
 
     def _free(self, gp: Host) -> Plan | None:

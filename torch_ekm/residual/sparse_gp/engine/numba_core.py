@@ -14,60 +14,10 @@ from ...base import FARTHEST
 from ...misled import MISLED_RATE, WORSE
 from .. import plan as P
 from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, RING_SIZE, Z90_SQUARED
-from .numba_kernels import absorb, kernel_row, kernel_slopes, times
-from .numba_math import (
-    A1,
-    A2,
-    COMMON,
-    I1,
-    INNER,
-    INT,
-    ON,
-    F,
-    exp,
-    integers_at,
-    matrix_at,
-    stack_at,
-    vector_at,
-)
-from .numba_network import network, network_of_many, network_slopes
-
-
-@njit(types.void(I1, INT, A1, A1), **INNER)
-def _embed(p, own, values, q):
-    """``q``: z as the kernel sees it, in its lengthscales and with a network's features behind.
-
-    ``values`` begins with z and takes each layer of the network, ``own`` is the place of the kernel.
-    """
-    d, n_s = p[P.IN], p[P.IN] - p[P.ACTIONS]
-    log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, n_s)
-    for j in range(n_s):
-        q[j] = values[j] * exp(-log_lengthscale[j])
-    for j in range(n_s, d):
-        q[j] = values[j]
-    if p[P.LAYERS] > 0:
-        widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        network(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values)
-        features = p[P.WIDTH] - d
-        for j in range(features):
-            q[d + j] = values[values.shape[0] - features + j]
-
-
-@njit(types.void(I1, INT, A2, A2), **INNER)
-def embed_many(p, own, values, q):
-    """Points as :func:`_embed` has one, a row each."""
-    d, n_s, features, n = p[P.IN], p[P.IN] - p[P.ACTIONS], p[P.WIDTH] - p[P.IN], values.shape[1]
-    log_lengthscale, by = vector_at(p[P.LOG_LENGTHSCALE], own, n_s), np.ones(d)
-    for j in range(n_s):
-        by[j] = exp(-log_lengthscale[j])
-    if features > 0:
-        widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        network_of_many(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values)
-    for i in range(values.shape[0]):
-        for j in range(d):
-            q[i, j] = values[i, j] * by[j]
-        for j in range(features):
-            q[i, d + j] = values[i, n - features + j]
+from .numba_kernels import embed, kernel_row, kernel_slopes, network_back, turn_weights
+from .numba_math import exp
+from .numba_memory import A1, A2, COMMON, I1, INNER, INT, ON, F, integers_at, matrix_at, vector_at
+from .numba_recursion import absorb, times
 
 
 @njit(types.void(I1), **COMMON)
@@ -77,10 +27,11 @@ def embed_fleet(p):
     values = np.empty((M, p[P.VALUES]))
     for b in range(p[P.MODELS]):
         basis = matrix_at(p[P.BASIS], b, M, d)
+        turn_weights(p, b * p[P.OWN])
         for i in range(M):
             for j in range(d):
                 values[i, j] = basis[i, j]
-        embed_many(p, b * p[P.OWN], values, matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH]))
+        embed(p, b * p[P.OWN], values, matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH]))
 
 
 @njit(F(I1, INT, A1, A1, A1, A1, A1, A1), **INNER)
@@ -94,12 +45,9 @@ def look(p, b, x, values, q, k, psi, phi):
     reach = vector_at(p[P.REACH], 0, d)
     for j in range(d):
         values[j] = min(max((x[j] - shift[j]) / scale[j], -reach[j]), reach[j])
-    _embed(p, own, values, q)
-    n_a, basis = p[P.ACTIONS], matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
-    return kernel_row(
-        p[P.KIND], n_a, q, basis, vector_at(p[P.ACTIVE], b, M), vector_at(p[P.LOG_VARIANCE], own, 1)[0],
-        vector_at(p[P.LOG_ACTION], own, n_a), k, psi, phi,
-    )  # fmt: skip
+    embed(p, own, values.reshape(1, values.shape[0]), q.reshape(1, q.shape[0]))
+    basis = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
+    return kernel_row(p, own, q, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi)
 
 
 @njit(F(I1, INT, F, A1, A1, A1), **INNER)
@@ -131,6 +79,16 @@ def cut(p, b, mean, inside):
         most = FARTHEST * largest[o]
         inside[o] = 1.0 if abs(mean[o]) <= most else 0.0
         mean[o] = min(max(mean[o], -most), most)
+
+
+@njit(F(I1, INT), **INNER)
+def shared_noise(p, b):
+    """See ``Host.shared_noise``."""
+    m, total = p[P.OUT], 0.0
+    log_noise = vector_at(p[P.LOG_NOISE], b, m)
+    for o in range(m):
+        total += log_noise[o]
+    return math.exp(total / m)
 
 
 @njit(types.void(I1, INT, A1), **INNER)
@@ -174,10 +132,12 @@ def query(p, b, with_variance, x, mean, variance, J, dv):
             left[i, o] = alpha[i, o]
         for o in range(m, rows):
             left[i, o] = 2.0 * Ck[i]
-    log_action = vector_at(p[P.LOG_ACTION], own, n_a)
-    kernel_slopes(q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, log_action, left, slopes)
+    kernel_slopes(p, own, q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, left, slopes)
     for o in range(m, rows):  # k(x, x) of an action-linear kernel
-        log_variance = vector_at(p[P.LOG_VARIANCE], own, 1)[0]
+        log_variance, log_action = (
+            vector_at(p[P.LOG_VARIANCE], own, 1)[0],
+            vector_at(p[P.LOG_ACTION], own, n_a),
+        )
         for j in range(n_a):
             slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
     log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d - n_a)
@@ -186,8 +146,11 @@ def query(p, b, with_variance, x, mean, variance, J, dv):
         for r in range(rows):
             slopes[r, j] *= by_q
     if p[P.LAYERS] > 0:
-        widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        network_slopes(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values, slopes)
+        by = np.empty((rows, W - d))
+        for r in range(rows):
+            for j in range(W - d):
+                by[r, j] = slopes[r, d + j]
+        network_back(p, own, values.reshape(1, values.shape[0]), by, slopes, np.empty(0))
     scale, reach = vector_at(p[P.SCALE], b, d), vector_at(p[P.REACH], 0, d)
     for j in range(d):
         by_x = 1.0 / scale[j] if abs(values[j]) < reach[j] else 0.0
@@ -219,28 +182,33 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
                 v[o] += noise[o]
 
 
-@njit(INT(I1, INT, A1, A1, A1, A1, F, A1, A1, A1, A1), **INNER)
-def learn(p, b, values, q, k, Ck, prior, y, t, figures, error):
-    """Learn the sample whose k, k(x, x) and Ck are at hand; returns the event. ``t``: room for y in units."""
+@njit(types.UniTuple(A1, 5)(I1, INT), **INNER)
+def room_of(p, b):
+    """What an update of model b finds: z with all layers, and as the kernel sees it, k, Ck, k(x, x)."""
+    n, W, M = p[P.VALUES], p[P.WIDTH], p[P.SLOTS]
+    at = p[P.ROOM] + 8 * b * (n + W + 2 * M + 1)
+    k = at + 8 * (n + W)
+    return (
+        vector_at(at, 0, n), vector_at(at + 8 * n, 0, W), vector_at(k, 0, M), vector_at(k, 1, M),
+        vector_at(k + 16 * M, 0, 1),
+    )  # fmt: skip
+
+
+@njit(INT(I1, INT, A1, A1, A1), **INNER)
+def learn(p, b, y, figures, error):
+    """Learn the sample whose k, k(x, x) and Ck are in the room; returns the event."""
     d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
-    shift, scale = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m)
-    log_noise, log_s2 = vector_at(p[P.LOG_NOISE], b, m), 0.0
+    values, q, k, Ck, prior = room_of(p, b)
+    shift, scale, t = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m), np.empty(m)
     for o in range(m):
         t[o] = (y[o] - shift[o]) / scale[o]
-        log_s2 += log_noise[o]
-    slot = integers_at(p[P.SLOT], b, 1)
-    basis = matrix_at(p[P.BASIS], b, M, d)
+    slot, basis = integers_at(p[P.SLOT], b, 1)[0], matrix_at(p[P.BASIS], b, M, d)
     for j in range(d):
-        basis[slot[0], j] = values[j]
+        basis[slot, j] = values[j]
     embedded = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
     for j in range(q.shape[0]):
-        embedded[slot[0], j] = q[j]
-    constants = vector_at(p[P.FIGURES], 0, 3)
-    return absorb(
-        t, prior, math.exp(log_s2 / m), k, Ck, vector_at(p[P.ACTIVE], b, M), integers_at(p[P.COUNT], b, 1),
-        slot, stack_at(p[P.MOMENTS], b, 3, M, M), stack_at(p[P.VECTORS], b, 2, M, m),
-        constants[2], vector_at(p[P.DISTRUSTED], b, 1), constants[0], constants[1], figures, error,
-    )  # fmt: skip
+        embedded[slot, j] = q[j]
+    return absorb(p, b, prior[0], shared_noise(p, b), k, Ck, t, figures, error)
 
 
 @njit(types.void(INT, INT, A1), **INNER)
@@ -331,14 +299,14 @@ def update_fleet(p, n, on, x, y, figures, event, errors):
     if not are_finite(p, x, y):
         return -1
     d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
-    values, q, t = np.empty(p[P.VALUES]), np.empty(p[P.WIDTH]), np.empty(m)
-    k, psi, Ck, phi, found = np.empty(M), np.empty(M), np.empty(M), np.empty(M), np.empty(4)
+    psi, phi, found = np.empty(M), np.empty(M), np.empty(4)
     for b in range(p[P.MODELS]):
         if not on[b]:
             continue
-        prior = look(p, b, vector_at(x, b, d), values, q, k, psi, phi)
+        values, q, k, Ck, prior = room_of(p, b)
+        prior[0] = look(p, b, vector_at(x, b, d), values, q, k, psi, phi)
         times(matrix_at(p[P.MOMENTS], 3 * b, M, M), k, Ck)
-        event[b] = learn(p, b, values, q, k, Ck, prior, vector_at(y, b, m), t, found, errors[b])
+        event[b] = learn(p, b, vector_at(y, b, m), found, errors[b])
         for r in range(4):
             figures[r, b] = found[r]
     return int(note(p, n, on, x, y, figures, errors))

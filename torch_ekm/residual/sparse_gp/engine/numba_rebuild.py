@@ -12,23 +12,10 @@ import numpy as np
 from numba import njit, types
 
 from .. import plan as P
-from .numba_kernels import of_distances
-from .numba_math import (
-    A1,
-    A2,
-    COMMON,
-    EPS,
-    I1,
-    INNER,
-    INT,
-    F,
-    add_products,
-    dot,
-    matrix_at,
-    stack_at,
-    transposed,
-    vector_at,
-)  # fmt: skip
+from .numba_core import shared_noise
+from .numba_kernels import kernel_rows
+from .numba_math import add_products, dot, transposed
+from .numba_memory import A1, A2, COMMON, EPS, I1, INNER, INT, F, matrix_at, stack_at, vector_at
 
 
 @njit(types.void(A2), **INNER)
@@ -85,28 +72,6 @@ def _solve(L, B, lower):
             row[j] *= by
 
 
-@njit(types.void(I1, INT, A2, A2, A1, A2, A2, A2, A1), **INNER)
-def kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal):
-    """See ``kernel_row``, of many points q; their k(q, q) into ``diagonal``."""
-    N, M, n_a, n_s = q.shape[0], basis.shape[0], p[P.ACTIONS], q.shape[1] - p[P.ACTIONS]
-    log_variance, log_action = vector_at(p[P.LOG_VARIANCE], own, 1)[0], vector_at(p[P.LOG_ACTION], own, n_a)
-    # about one of the points: far from 0 the difference of large squares would be all rounding
-    a, c, a2, c2 = np.empty((N, n_s)), np.empty((M, n_s)), np.zeros(N), np.zeros(M)
-    for of, to, squares in ((q, a, a2), (basis, c, c2)):
-        for i in range(of.shape[0]):
-            for j in range(n_s):
-                to[i, j] = of[i, j] - basis[0, j]
-            squares[i] = dot(to[i], to[i], n_s)
-    k[:, :] = 0.0
-    add_products(a, c, -2.0, k, False, False)
-    for i in range(N):
-        for j in range(M):
-            k[i, j] = max(k[i, j] + a2[i] + c2[j], 0.0)
-        diagonal[i] = of_distances(
-            p[P.KIND], n_a, q[i], basis, active, log_variance, log_action, k[i], psi[i], phi[i]
-        )
-
-
 @njit(A2(I1, INT, A2, A1), **INNER)
 def _gram(p, b, embedded, active):
     """K between the points in use, embedded, with the jitter; 1 on the diagonal of free slots."""
@@ -118,16 +83,6 @@ def _gram(p, b, embedded, active):
             K[i, j] *= active[i]
         K[i, i] = diagonal[i] * jitter if active[i] else 1.0
     return K
-
-
-@njit(F(I1, INT), **INNER)
-def shared_noise(p, b):
-    """See ``Host.shared_noise``."""
-    m, total = p[P.OUT], 0.0
-    log_noise = vector_at(p[P.LOG_NOISE], b, m)
-    for o in range(m):
-        total += log_noise[o]
-    return math.exp(total / m)
 
 
 @njit(types.void(A2, A2, A2, A2, F, F), **INNER)
