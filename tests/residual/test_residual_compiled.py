@@ -151,6 +151,23 @@ def test_compiled_steps_and_rebuilds_are_those_of_torch(name, shape, memory):
     assert torch.equal(fast(x[0]), copied(x[0]))
 
 
+@numba_here
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_compiled_units_are_those_of_numpy(shape):
+    generator = torch.Generator().manual_seed(0)
+    gp, other = (SparseOnlineGP(D, M, parts=[Standardize()], batch_shape=shape) for _ in range(2))
+    for k in range(6):
+        x = torch.randn(*shape, 32, D, generator=generator, dtype=torch.float64)
+        x = (x * 1e3 if k == 3 else x) * x.new_tensor([1.0, 0.0 if k == 2 else 1e-6, 1e150, 1.0])
+        x[..., 7 : 9 + k, :] *= 100.0
+        on = (torch.rand(*shape, 32, generator=generator) < 0.9).double()
+        assert gp.engine is not None
+        assert gp.engine.pool(gp, x, x[..., :M], on)
+        other.units.pool(x, x[..., :M], on)
+    for a, b in zip(gp.units.buffers(), other.units.buffers(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-15, rtol=1e-7)
+
+
 class Periodic(SquaredExponential):
     pass
 

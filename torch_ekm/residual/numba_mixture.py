@@ -20,9 +20,11 @@ from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
-from .sparse_gp.engine.numba_descent import descend_fleet as descend_fleet
+from .sparse_gp.engine.numba_descent import gather_fleet as gather_fleet
+from .sparse_gp.engine.numba_descent import step_fleet as step_fleet
 from .sparse_gp.engine.numba_memory import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
 from .sparse_gp.engine.numba_rebuild import rebuild_fleet as rebuild_fleet
+from .sparse_gp.engine.numba_units import pool_columns as pool_columns
 
 embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
 
@@ -117,38 +119,34 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
     return alarm
 
 
-@njit(types.void(I1, I2, INT, INT, INT, INT, INT, INT, INT), **COMMON)
-def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
-    """One query per model; results by their addresses (0: not wanted), see ``MixtureResidual``.
+@njit(types.void(I1, I2, INT, INT, INT, INT, INT, INT, INT, INT, INT, INT), **COMMON)
+def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, deviation, standard, J, dv):
+    """One query per model from what its learners say, see ``MixtureResidual``; by addresses (0: not wanted).
 
     Args:
+        means_of, latent_of: means and latent variances of all members, and derivatives.
         variance, deviation: of g.
         standard: deviation of y by which innovations are standardised.
         J, dv: derivatives of mean and variance by x.
     """
     B, d, m, n = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
     n_shares, n_experts = g[G.N_SHARES], g[G.N_EXPERTS]
-    with_variance, rows = variance != 0 or deviation != 0 or standard != 0, m if J else 0
-    rows_dv = m if dv else 0
     h = matrix_at(g[G.EXPERTS], 0, 5, n_experts)[0]
     each = n_experts // (n * n_shares)
     means, latent, noisy = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
-    J_of, dv_of = np.empty((n + 1, rows, d)), np.empty((n, rows_dv, d))
-    one, v, noise, log_factor, none = np.empty(m), np.empty(m), np.zeros(m), np.zeros(m), np.empty((0, d))
+    noise, log_factor, by_x = np.empty(m), np.zeros(m), np.zeros(m)
     for b in range(B):
-        if with_variance:
-            gp.query(members[n], b, False, vector_at(x, b, d), log_factor, v, J_of[n, :rows_dv], none)
-            for o in range(m):
-                share = share_of_noise(g, b * m + o)
-                for j in range(d if rows_dv else 0):
-                    J_of[n, o, j] *= share if abs(log_factor[o]) < L.REACH else 0.0
-                log_factor[o] = share * min(max(log_factor[o], -L.REACH), L.REACH)
         for i in range(n):
-            gp.query(members[i], b, with_variance, vector_at(x, b, d), one, v, J_of[i], dv_of[i])
-            if with_variance:
-                gp.noise_of(members[i], b, noise)
+            told, v = vector_at(means_of, i * B + b, m), vector_at(latent_of, i * B + b, m)
+            gp.noise_of(members[i], b, noise)
             for o in range(m):
-                means[o, i], latent[o, i], noisy[o, i] = one[o], v[o], v[o] + noise[o]
+                means[o, i] = told[o]
+                latent[o, i] = v[o] if latent_of else 0.0
+                noisy[o, i] = latent[o, i] + noise[o]
+        for o in range(m if latent_of else 0):
+            share, f = share_of_noise(g, b * m + o), vector_at(means_of, n * B + b, m)[o]
+            by_x[o] = share if abs(f) < L.REACH else 0.0
+            log_factor[o] = share * min(max(f, -L.REACH), L.REACH)
         for o in range(m):
             r = b * m + o
             make_finite(g, r, means[o], latent[o])
@@ -157,15 +155,14 @@ def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
             value = min(max(free, -most), most)
             vector_at(mean, r, 1)[0] = value
             gain = vector_at(g[G.GAIN], r, n)
-            if rows:
+            if J:
                 to = vector_at(J, r, d)
                 to[:] = 0.0
-                if free == value:
-                    for i in range(n):
-                        for j in range(d):
-                            s = J_of[i, o, j]
-                            to[j] += gain[i] * s if math.isfinite(s) else 0.0
-            if not with_variance:
+                for i in range(n if free == value else 0):
+                    slope = vector_at(J_of, i * B * m + r, d)
+                    for j in range(d):
+                        to[j] += gain[i] * slope[j] if math.isfinite(slope[j]) else 0.0
+            if not latent_of:
                 continue
             mass, shift = vector_at(g[G.MASS], r, n * n_shares), vector_at(g[G.SHIFT], r, n * n_shares)
             spread, total = vector_at(g[G.SPREAD], r, n * n_shares), 0.0
@@ -182,18 +179,17 @@ def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
                 vector_at(deviation, r, 1)[0] = math.sqrt(min(total, bound))
             if variance:
                 vector_at(variance, r, 1)[0] = min(total, bound)
-            if rows_dv:
-                to = vector_at(dv, r, d)
+            if dv:
+                to, of_noise = vector_at(dv, r, d), vector_at(J_of, n * B * m + r, d)
                 for j in range(d):
-                    to[j] = 2.0 * bound * J_of[n, o, j] if total > bound else 0.0
+                    to[j] = 2.0 * bound * by_x[o] * of_noise[j] if total > bound else 0.0
                 for k in range(n * n_shares):
                     i, share = k // n_shares, h[k * each]
+                    slope, slope_v = vector_at(J_of, i * B * m + r, d), vector_at(dv_of, i * B * m + r, d)
                     apart = share * means[o, i] + shift[k] - value
                     by_v, by_m = mass[k] * share * share, 2.0 * mass[k] * apart * share
                     if total > bound:
                         by_v, by_m = mass[k] * by_noise, 0.0
                     for j in range(d):
-                        s, f = dv_of[i, o, j], J_of[i, o, j]
-                        to[j] += by_v * (s if math.isfinite(s) else 0.0) + by_m * (
-                            f if math.isfinite(f) else 0.0
-                        )
+                        to[j] += by_v * slope_v[j] if math.isfinite(slope_v[j]) else 0.0
+                        to[j] += by_m * slope[j] if math.isfinite(slope[j]) else 0.0

@@ -29,7 +29,7 @@ NETWORK_RATE = 0.015
 # features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
 NETWORK_DECAY = 0.25
 LEAST, LEAST_NOISE, MOST = -7.0, -14.0, 7.0  # of logarithms: far beyond what standardised data can mean
-PARTS = 0.25, 0.75, 1.0  #: of its samples after which the parts of a step end
+PARTS = 0.12, 0.78, 1.0  #: of its samples after which the parts of a step end
 _SHORT = 8  # samples between two rebuilds from which on a step leaves the last one out
 
 

@@ -178,7 +178,7 @@ class Plan(Bound):
         M, m, n = row[P.SLOTS], gp.out_features, at + gp.out_features
         row[P.LEARNING] = self.own(np.array([learning.window, learning.replayed(gp), len(rows), n]))
         row[P.PARAMETERS] = self.own(np.array(rows))
-        row[P.SUMS] = self.own(np.empty(M * (2 * M + m + row[P.WIDTH]) + n + 1))
+        row[P.SUMS] = self.own(np.empty((len(self.all), M * (2 * M + m + row[P.WIDTH]) + n + 3)))
         return row
 
     def is_rough(self, gp: Host) -> bool:

@@ -104,63 +104,6 @@ def noise_of(p, b, noise):
             noise[o] *= math.exp(factor[o])
 
 
-@njit(types.void(I1, INT, types.boolean, A1, A1, A1, A2, A2), **INNER)
-def query(p, b, with_variance, x, mean, variance, J, dv):
-    """One query of model b: mean, latent variance and, where J and dv have rows, their derivatives.
-
-    ``variance`` and ``dv`` are those of a unit output scale in their first entry and row.
-    """
-    d, m, M, W = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH]
-    n_a, own = p[P.ACTIONS], b * p[P.OWN]
-    values, q, inside = np.empty(p[P.VALUES]), np.empty(W), np.empty(m)
-    k, psi, Ck = np.empty(M), np.empty(M), np.empty(M)
-    phi = np.empty(M if n_a > 0 else 0)
-    prior = look(p, b, x, values, q, k, psi, phi)
-    v = mean_and_variance(p, b, prior, k, Ck, mean)
-    cut(p, b, mean, inside)
-    scale_y = vector_at(p[P.SCALE_Y], b, m)
-    if with_variance:
-        for o in range(m):
-            variance[o] = v * scale_y[o] * scale_y[o]
-    if J.shape[0] == 0:
-        return
-    rows = m + 1 if dv.shape[0] > 0 else m
-    alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
-    left, slopes = np.empty((M, rows)), np.empty((rows, W))
-    for i in range(M):
-        for o in range(m):
-            left[i, o] = alpha[i, o]
-        for o in range(m, rows):
-            left[i, o] = 2.0 * Ck[i]
-    kernel_slopes(p, own, q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, left, slopes)
-    for o in range(m, rows):  # k(x, x) of an action-linear kernel
-        log_variance, log_action = (
-            vector_at(p[P.LOG_VARIANCE], own, 1)[0],
-            vector_at(p[P.LOG_ACTION], own, n_a),
-        )
-        for j in range(n_a):
-            slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
-    log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d - n_a)
-    for j in range(d - n_a):
-        by_q = exp(-log_lengthscale[j])
-        for r in range(rows):
-            slopes[r, j] *= by_q
-    if p[P.LAYERS] > 0:
-        by = np.empty((rows, W - d))
-        for r in range(rows):
-            for j in range(W - d):
-                by[r, j] = slopes[r, d + j]
-        network_back(p, own, values.reshape(1, values.shape[0]), by, slopes, np.empty(0))
-    scale, reach = vector_at(p[P.SCALE], b, d), vector_at(p[P.REACH], 0, d)
-    for j in range(d):
-        by_x = 1.0 / scale[j] if abs(values[j]) < reach[j] else 0.0
-        for o in range(m):
-            J[o, j] = slopes[o, j] * scale_y[o] * by_x * inside[o]
-        for o in range(m, rows):
-            for to in range(m):
-                dv[to, j] = slopes[o, j] * scale_y[to] * scale_y[to] * by_x
-
-
 @njit(types.void(I1, types.boolean, INT, INT, INT, INT, INT), **COMMON)
 def query_fleet(p, noisy, x, mean, variance, J, dv):
     """One query per model, all given by their addresses (0: not wanted), see ``SparseOnlineGP``.
@@ -168,18 +111,55 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
     Args:
         noisy: whether the variance is that of y.
     """
-    d, m = p[P.IN], p[P.OUT]
-    noise = np.empty(m)
+    d, m, M, W, n_a = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH], p[P.ACTIONS]
+    values, q, inside, noise = np.empty(p[P.VALUES]), np.empty(W), np.empty(m), np.zeros(m)
+    k, psi, Ck, phi = np.empty(M), np.empty(M), np.empty(M), np.empty(M if n_a > 0 else 0)
+    rows = (m + 1 if dv else m) if J else 0
+    left, slopes, by = np.empty((M, rows)), np.empty((rows, W)), np.empty((rows, W - d))
+    reach = vector_at(p[P.REACH], 0, d)
     for b in range(p[P.MODELS]):
-        v = vector_at(variance, b, m)
-        query(
-            p, b, variance != 0, vector_at(x, b, d), vector_at(mean, b, m), v,
-            matrix_at(J, b, m if J else 0, d), matrix_at(dv, b, m if dv else 0, d),
-        )  # fmt: skip
+        own, mean_ = b * p[P.OWN], vector_at(mean, b, m)
+        prior = look(p, b, vector_at(x, b, d), values, q, k, psi, phi)
+        v = mean_and_variance(p, b, prior, k, Ck, mean_)
+        cut(p, b, mean_, inside)
+        scale, scale_y = vector_at(p[P.SCALE], b, d), vector_at(p[P.SCALE_Y], b, m)
         if noisy:
             noise_of(p, b, noise)
+        for o in range(m if variance else 0):
+            vector_at(variance, b, m)[o] = v * scale_y[o] * scale_y[o] + noise[o]
+        if rows == 0:
+            continue
+        alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
+        for i in range(M):
             for o in range(m):
-                v[o] += noise[o]
+                left[i, o] = alpha[i, o]
+            for o in range(m, rows):
+                left[i, o] = 2.0 * Ck[i]
+        kernel_slopes(p, own, q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, left, slopes)
+        log_variance, log_action = (
+            vector_at(p[P.LOG_VARIANCE], own, 1)[0],
+            vector_at(p[P.LOG_ACTION], own, n_a),
+        )
+        for o in range(m, rows):  # k(x, x) of an action-linear kernel
+            for j in range(n_a):
+                slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
+        log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d - n_a)
+        for j in range(d - n_a):
+            by_q = exp(-log_lengthscale[j])
+            for r in range(rows):
+                slopes[r, j] *= by_q
+        if d < W:
+            for r in range(rows):
+                for j in range(W - d):
+                    by[r, j] = slopes[r, d + j]
+            network_back(p, own, values.reshape(1, values.shape[0]), by, slopes, np.empty(0))
+        for j in range(d):
+            by_x = 1.0 / scale[j] if abs(values[j]) < reach[j] else 0.0
+            for o in range(m):
+                matrix_at(J, b, m, d)[o, j] = slopes[o, j] * scale_y[o] * by_x * inside[o]
+            for o in range(m, rows):
+                for to in range(m):
+                    matrix_at(dv, b, m, d)[to, j] = slopes[o, j] * scale_y[to] * scale_y[to] * by_x
 
 
 @njit(types.UniTuple(A1, 5)(I1, INT), **INNER)
@@ -209,14 +189,6 @@ def learn(p, b, y, figures, error):
     for j in range(q.shape[0]):
         embedded[slot, j] = q[j]
     return absorb(p, b, prior[0], shared_noise(p, b), k, Ck, t, figures, error)
-
-
-@njit(types.void(INT, INT, A1), **INNER)
-def write(address, at, values):
-    """To the place ``at`` of a list of such vectors."""
-    to = vector_at(address, at, values.shape[0])
-    for j in range(values.shape[0]):
-        to[j] = values[j]
 
 
 @njit(types.void(I1, ON, INT), **INNER)
@@ -251,15 +223,15 @@ def changed(p, n, on, y, figures, errors):
 
 @njit(types.boolean(I1, INT, ON, INT, INT, A2, A2), **INNER)
 def note(p, n, on, x, y, figures, errors):
-    """All notes of the sample after n (-1: none) per model; whether a model faces another system."""
-    if n < 0:
-        return False
+    """All notes of the sample after n per model; whether a model faces another system."""
     d, m = p[P.IN], p[P.OUT]
     grow_largest(p, on, y)
     for b in range(p[P.MODELS]):
         one, at = 1.0 if on[b] else 0.0, b * p[P.RECENT_SIZE] + n % p[P.RECENT_SIZE]
-        write(p[P.RECENT_X], at, vector_at(x, b, d))
-        write(p[P.RECENT_Y], at, vector_at(y, b, m))
+        for kept, new, width in ((p[P.RECENT_X], x, d), (p[P.RECENT_Y], y, m)):
+            to, values = vector_at(kept, at, width), vector_at(new, b, width)
+            for j in range(width):
+                to[j] = values[j]
         vector_at(p[P.RECENT_ON], at, 1)[0] = one
         vector_at(p[P.RECENT], at, 1)[0] = figures[2, b] * one
         vector_at(p[P.PENDING], b, 1)[0] += one
@@ -285,21 +257,20 @@ def are_finite(p, x, y):
     return math.isfinite(total)
 
 
-@njit(INT(I1, INT, ON, INT, INT, A2, I1, A2), **COMMON)
-def update_fleet(p, n, on, x, y, figures, event, errors):
-    """The sample after n (-1: without notes) per model where ``on``, given by addresses.
+@njit(INT(I1, INT, ON, INT, INT, A2, I1), **COMMON)
+def update_fleet(p, n, on, x, y, figures, event):
+    """The sample after n per model where ``on``, given by addresses.
 
     Returns:
         1 where a model faces another system, else 0; -1: a sample is not finite, and nothing was done.
 
     Args:
         figures: novelty, nis, weight and latent variance of each model; as they are where not ``on``.
-        errors: innovations ``(models, out)``, in the learner's units.
     """
     if not are_finite(p, x, y):
         return -1
     d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
-    psi, phi, found = np.empty(M), np.empty(M), np.empty(4)
+    psi, phi, found, errors = np.empty(M), np.empty(M), np.empty(4), np.empty((on.shape[0], m))
     for b in range(p[P.MODELS]):
         if not on[b]:
             continue

@@ -43,19 +43,20 @@ from .numba_memory import (
 )
 
 #: of the queries so far: derivatives by K through E and through F, by alpha, by basis points; by all
-#: parameters; by ln s2
+#: parameters; by ln s2, and weight of all and of those that the past state has not seen
 SUMS = types.Tuple((A2, A2, A2, A2, A1, A1))
 
 
-@njit(SUMS(I1), **INNER)
-def _sums(p):
+@njit(SUMS(I1, INT), **INNER)
+def _sums(p, b):
     """Memory of them."""
     M, W, m, n = p[P.SLOTS], p[P.WIDTH], p[P.OUT], integers_at(p[P.LEARNING], 0, 4)[3]
-    at, by_alpha = p[P.SUMS], p[P.SUMS] + 16 * M * M
+    at = p[P.SUMS] + 8 * b * (M * (2 * M + m + W) + n + 3)
+    by_alpha = at + 16 * M * M
     back, gradient = by_alpha + 8 * M * m, by_alpha + 8 * M * (m + W)
     return (
         matrix_at(at, 0, M, M), matrix_at(at, 1, M, M), matrix_at(by_alpha, 0, M, m),
-        matrix_at(back, 0, M, W), vector_at(gradient, 0, n), vector_at(gradient + 8 * n, 0, 1),
+        matrix_at(back, 0, M, W), vector_at(gradient, 0, n), vector_at(gradient + 8 * n, 0, 3),
     )  # fmt: skip
 
 
@@ -148,7 +149,7 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
         of_basis: whether the points are these: a pair of them counts for both.
     """
     N, M, W, n_a, own = k.shape[0], p[P.SLOTS], p[P.WIDTH], p[P.ACTIONS], b * p[P.OWN]
-    d, n_s, gradient = p[P.IN], p[P.IN] - n_a, _sums(p)[4]
+    d, n_s, gradient = p[P.IN], p[P.IN] - n_a, _sums(p, b)[4]
     log_action, variance = (
         vector_at(p[P.LOG_ACTION], own, n_a),
         math.exp(vector_at(p[P.LOG_VARIANCE], own, 1)[0]),
@@ -205,77 +206,70 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
         network_back(p, own, values, features, np.empty((0, 0)), gradient)
 
 
-@njit(types.void(I1, INT, A2, A2, A2), **INNER)
-def _take(p, b, x, y, about):
-    """Some of the queries into the sums: what the past state of model b says of them, and what follows."""
-    n, d, m, M, W, own = x.shape[0], p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH], b * p[P.OWN]
-    active, basis = vector_at(p[P.ACTIVE], b, M), matrix_at(p[P.EMBEDDED], b, M, W)
-    moments, alpha = stack_at(p[P.MOMENTS], b, 3, M, M), matrix_at(p[P.VECTORS], 2 * b, M, m)
-    values, q = np.empty((n, p[P.VALUES])), np.empty((n, W))
-    for i in range(n):
-        for j in range(d):
-            values[i, j] = x[i, j]
-    embed(p, own, values, q)
-    k, psi, phi, diagonal = np.empty((n, M)), np.empty((n, M)), np.empty((n, M)), np.empty(n)
-    kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal)
-    E, F_, mean = np.zeros((n, M)), np.zeros((n, M)), np.zeros((n, m))
-    add_products(k, moments[0], 1.0, E, False, False)
-    add_products(k, moments[1], 1.0, F_, False, False)
-    add_products(k, transposed(alpha), 1.0, mean, False, False)
-    kE_u, by_mean, by_q = np.empty((n, 2)), np.empty((n, m)), np.empty((n, 3))
-    for i in range(n):
-        kE_u[i, 0], kE_u[i, 1] = dot(k[i], E[i], M), dot(k[i], F_[i], M)
-    by_K, less, by_alpha, back, gradient, by_s2 = _sums(p)
-    _density(p, b, mean, y, diagonal, kE_u, about, by_mean, gradient[gradient.shape[0] - m :], by_q)
-    by, by_diagonal, by_E, by_F = np.zeros((n, M)), np.empty(n), np.empty((n, M)), np.empty((n, M))
-    add_products(by_mean, alpha, 1.0, by, False, False)
-    for i in range(n):
-        g_E, g_F = by_q[i, 0] + by_q[i, 1], by_q[i, 1] + by_q[i, 2]
-        by_diagonal[i] = by_q[i, 0]
-        for j in range(M):
-            by_E[i, j] = E[i, j] * g_E
-        for j in range(M):
-            by_F[i, j] = F_[i, j] * g_F
-        by_s2[0] += dot(by_mean[i], mean[i], m) + dot(by_E[i], k[i], M)
-        row = by[i]
-        for j in range(M):
-            row[j] += 2.0 * (by_E[i, j] + by_F[i, j])
-    E_t = transposed(E)
-    add_products(E_t, transposed(by_mean), 1.0, by_alpha, False, False)
-    add_products(E_t, transposed(by_E), 1.0, by_K, True, False)
-    add_products(transposed(F_), transposed(by_F), 1.0, less, True, False)
-    _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, False)
+@njit(types.void(I1, INT, INT, INT, F, F), **COMMON)
+def gather_fleet(p, n, n_rebuilt, n_taken, begin, end):
+    """A part of a step: what the past states, whose basis is embedded, say of the queries, into the sums.
+
+    ``begin``, ``end``: of the queries, as shares of all.
+    """
+    d, m, M, W, learning = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH], integers_at(p[P.LEARNING], 0, 4)
+    most = learning[0] + learning[1]
+    x, y_, about_ = np.empty((most, d)), np.empty((most, m)), np.empty((most, 2))
+    for b in range(p[P.MODELS]):
+        by_K, less, by_alpha, back, gradient, rest = _sums(p, b)
+        for part in (by_K, less, by_alpha, back):
+            for i in range(M if begin == 0.0 else 0):
+                part[i] = 0.0
+        for part in (gradient, rest):
+            for i in range(part.shape[0] if begin == 0.0 else 0):
+                part[i] = 0.0
+        found = _draw(p, b, n, n_rebuilt, n_taken, x, y_, about_)
+        first, last, own = int(begin * found), int(end * found), b * p[P.OWN]
+        y, about, N = y_[first:last], about_[first:last], last - first
+        active, basis = vector_at(p[P.ACTIVE], b, M), matrix_at(p[P.EMBEDDED], b, M, W)
+        moments, alpha = stack_at(p[P.MOMENTS], b, 3, M, M), matrix_at(p[P.VECTORS], 2 * b, M, m)
+        values, q = np.empty((N, p[P.VALUES])), np.empty((N, W))
+        for i in range(N):
+            for j in range(d):
+                values[i, j] = x[first + i, j]
+        embed(p, own, values, q)
+        k, psi, phi, diagonal = np.empty((N, M)), np.empty((N, M)), np.empty((N, M)), np.empty(N)
+        kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal)
+        E, F_, mean = np.zeros((N, M)), np.zeros((N, M)), np.zeros((N, m))
+        add_products(k, moments[0], 1.0, E, False, False)
+        add_products(k, moments[1], 1.0, F_, False, False)
+        add_products(k, transposed(alpha), 1.0, mean, False, False)
+        kE_u, by_mean, by_q = np.empty((N, 2)), np.empty((N, m)), np.empty((N, 3))
+        for i in range(N):
+            kE_u[i, 0], kE_u[i, 1] = dot(k[i], E[i], M), dot(k[i], F_[i], M)
+        _density(p, b, mean, y, diagonal, kE_u, about, by_mean, gradient[gradient.shape[0] - m :], by_q)
+        by, by_diagonal, by_E, by_F = np.zeros((N, M)), np.empty(N), np.empty((N, M)), np.empty((N, M))
+        add_products(by_mean, alpha, 1.0, by, False, False)
+        for i in range(N):
+            rest[1] += about[i, 0]
+            rest[2] += about[i, 0] if about[i, 1] == 0.0 else 0.0
+            g_E, g_F = by_q[i, 0] + by_q[i, 1], by_q[i, 1] + by_q[i, 2]
+            by_diagonal[i] = by_q[i, 0]
+            for j in range(M):
+                by_E[i, j] = E[i, j] * g_E
+            for j in range(M):
+                by_F[i, j] = F_[i, j] * g_F
+            rest[0] += dot(by_mean[i], mean[i], m) + dot(by_E[i], k[i], M)
+            row = by[i]
+            for j in range(M):
+                row[j] += 2.0 * (by_E[i, j] + by_F[i, j])
+        E_t = transposed(E)
+        add_products(E_t, transposed(by_mean), 1.0, by_alpha, False, False)
+        add_products(E_t, transposed(by_E), 1.0, by_K, True, False)
+        add_products(transposed(F_), transposed(by_F), 1.0, less, True, False)
+        _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, False)
 
 
 @njit(types.void(I1, INT), **INNER)
-def _close(p, b):
-    """The gradient from the sums: what is left is the part of K."""
-    d, m, M, W, own = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH], b * p[P.OWN]
-    points, alpha = matrix_at(p[P.BASIS], b, M, d), matrix_at(p[P.VECTORS], 2 * b, M, m)
-    values, basis = np.empty((M, p[P.VALUES])), matrix_at(p[P.EMBEDDED], b, M, W)
-    for i in range(M):
-        for j in range(d):
-            values[i, j] = points[i, j]
-    network(p, own, values)
-    k, psi, phi, diagonal = np.empty((M, M)), np.empty((M, M)), np.empty((M, M)), np.empty(M)
-    kernel_rows(p, own, basis, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi, diagonal)
-    by_K, less, T, back, gradient, by_s2 = _sums(p)
-    jitter, by, by_diagonal = 1.0 + vector_at(p[P.FIGURES], 0, 3)[1], np.zeros((M, M)), np.empty(M)
-    for i in range(M):
-        for j in range(i + 1):
-            a = by_K[i, j] + 0.5 * (dot(T[i], alpha[j], m) + dot(alpha[i], T[j], m))
-            by_s2[0] += 2.0 * a * k[i, j] if j < i else a * diagonal[i] * jitter
-            by[i, j] = by[j, i] = a - less[i, j] if j < i else 0.0
-            by_diagonal[i] = (a - less[i, j]) * jitter
-    for o in range(m):
-        gradient[gradient.shape[0] - m + o] -= by_s2[0] / m
-    _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, basis, basis, back, True)
-
-
-@njit(types.void(I1, INT, F), **INNER)
-def _step(p, b, total):
-    """Of Adam, of model b; ``total``: weight of all queries."""
-    gradient, (b1, b2), steps = _sums(p)[4], BETAS, vector_at(p[P.N_STEPS], b, 1)
+def _step(p, b):
+    """Of Adam, of model b."""
+    gradient, rest = _sums(p, b)[4:]
+    (b1, b2), steps = BETAS, vector_at(p[P.N_STEPS], b, 1)
     rate = vector_at(p[P.RATES], 0, 3)[0]
     steps[0] += 1.0
     shrink = max(1.0 / math.sqrt(1.0 + steps[0] / 30.0), 0.1)
@@ -291,7 +285,7 @@ def _step(p, b, total):
         )
         step = (rate if kind > 0 else NETWORK_RATE) * correction
         for j in range(size):
-            g = by[j] / total
+            g = by[j] / rest[1]
             if kind == 0:
                 theta[j] -= decay * theta[j]
             if math.isfinite(g):
@@ -302,28 +296,35 @@ def _step(p, b, total):
                 theta[j] = min(max(theta[j], LEAST_NOISE if kind == 2 else LEAST), MOST)
 
 
-@njit(types.void(I1, INT, INT, INT, F, F), **COMMON)
-def descend_fleet(p, n, n_rebuilt, n_taken, begin, end):
-    """A step of Adam of each model, whose basis is embedded.
-
-    That of one may come in parts: of the queries from ``begin`` to ``end``, shares of all.
-    """
-    learning = integers_at(p[P.LEARNING], 0, 4)
-    most, size = (
-        learning[0] + learning[1],
-        p[P.SLOTS] * (2 * p[P.SLOTS] + p[P.OUT] + p[P.WIDTH]) + learning[3] + 1,
-    )
-    x, y, about = np.empty((most, p[P.IN])), np.empty((most, p[P.OUT])), np.empty((most, 2))
+@njit(types.void(I1), **COMMON)
+def step_fleet(p):
+    """The rest of a step: the part of K in the gradient of each model, and Adam's move."""
+    d, m, M, W = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH]
+    values, k, psi, phi = np.empty((M, p[P.VALUES])), np.empty((M, M)), np.empty((M, M)), np.empty((M, M))
+    diagonal, jitter = np.empty(M), 1.0 + vector_at(p[P.FIGURES], 0, 3)[1]
     for b in range(p[P.MODELS]):
-        k = _draw(p, b, n, n_rebuilt, n_taken, x, y, about)
-        total, counts, first, last = 0.0, 0.0, int(begin * k), int(end * k)
-        for i in range(k):
-            total += about[i, 0]
-            counts += about[i, 0] if about[i, 1] == 0.0 else 0.0
-        if begin == 0.0:
-            memory = vector_at(p[P.SUMS], 0, size)
-            memory[:] = 0.0
-        _take(p, b, x[first:last], y[first:last], about[first:last])
-        if end == 1.0 and counts > 0.0:
-            _close(p, b)
-            _step(p, b, total)
+        by_K, less, T, back, gradient, rest = _sums(p, b)
+        if rest[2] == 0.0:
+            continue
+        points, alpha, own = (
+            matrix_at(p[P.BASIS], b, M, d),
+            matrix_at(p[P.VECTORS], 2 * b, M, m),
+            b * p[P.OWN],
+        )
+        basis = matrix_at(p[P.EMBEDDED], b, M, W)
+        for i in range(M):
+            for j in range(d):
+                values[i, j] = points[i, j]
+        network(p, own, values)
+        kernel_rows(p, own, basis, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi, diagonal)
+        by, by_diagonal, by_s2 = np.zeros((M, M)), np.empty(M), rest[0]
+        for i in range(M):
+            for j in range(i + 1):
+                a = by_K[i, j] + 0.5 * (dot(T[i], alpha[j], m) + dot(alpha[i], T[j], m))
+                by_s2 += 2.0 * a * k[i, j] if j < i else a * diagonal[i] * jitter
+                by[i, j] = by[j, i] = a - less[i, j] if j < i else 0.0
+                by_diagonal[i] = (a - less[i, j]) * jitter
+        for o in range(m):
+            gradient[gradient.shape[0] - m + o] -= by_s2 / m
+        _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, basis, basis, back, True)
+        _step(p, b)
