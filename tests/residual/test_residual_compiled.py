@@ -230,7 +230,8 @@ def test_rows_that_are_not_contiguous_are_learned_as_they_are(monkeypatch):
     apart = x.mT.contiguous().mT
     assert not apart[0].is_contiguous()
     for t in range(len(x)):
-        assert used(other, lambda t=t: other.update(apart[t], y[t]), monkeypatch)
+        rough = t & (t + 1) == 0  # then all are learned again in new units, by torch
+        assert used(other, lambda t=t: other.update(apart[t], y[t]), monkeypatch) is not rough
         gp.update(x[t], y[t])
         assert torch.equal(gp(x[t]), other(apart[t]))
 

@@ -29,7 +29,7 @@ NETWORK_RATE = 0.015
 # features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
 NETWORK_DECAY = 0.25
 LEAST, LEAST_NOISE, MOST = -7.0, -14.0, 7.0  # of logarithms: far beyond what standardised data can mean
-PARTS = 0.12, 0.78, 1.0  #: of its samples after which the parts of a step end
+PARTS = 0.45, 1.0  #: of its samples after which the parts of a step end
 _SHORT = 8  # samples between two rebuilds from which on a step leaves the last one out
 
 
@@ -106,7 +106,7 @@ class LearnHyperparameters(Part):
         elif learner.engine is not None and self.lead and self.memory:
             for ahead in range(1, len(PARTS)):  # a large step in parts
                 if self._is_due(learner, n + ahead):
-                    learner.engine.descend(learner, self, n + ahead - self.lead, PARTS[-1 - ahead])
+                    learner.engine.descend(learner, self, n + ahead, PARTS[-1 - ahead])
         if self._leads and learner.is_due(n):
             for p, ahead in zip(self.theta(learner).values(), self.ahead().values(), strict=True):
                 p.copy_(ahead)
@@ -182,7 +182,7 @@ class LearnHyperparameters(Part):
 
     def descend(self, learner: Host) -> None:
         """A step of Adam on the loss, model by model; without samples or a finite gradient it stays."""
-        n = learner.n_samples + 1 - self.lead
+        n = learner.n_samples + 1
         if learner.engine is None or not learner.engine.descend(learner, self, n, PARTS[-1]):
             self._descend(learner, n)
         self._begin(self.since[0], True)
