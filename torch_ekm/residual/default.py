@@ -57,8 +57,10 @@ def default_learner(
     common: dict[str, Any] = {
         "capacity": capacity, "standardize": units, "refresh_every": every, **options
     }  # fmt: skip
+    # of functions linear in x as many points say all
+    few = min(capacity, d + 1) if type(d) is type(capacity) is int else capacity
     # no two rebuilds fall together, nor one and the step that a deep kernel takes halfway between its own
-    late = [{**common, "refresh_offset": offset} for offset in (0, 12, 6, 22)]
+    late: list[dict[str, Any]] = [{**common, "refresh_offset": offset} for offset in (0, 12, 6, 5)]
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     fades = [RobustWeight(3.0), ForgettingFactor(0.998), LearnHyperparameters()]
@@ -66,7 +68,7 @@ def default_learner(
         DeepKernelSOGP(d, m, base=_long(d, fleet), parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
         DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[1]),
         SparseOnlineGP(d, m, parts=wanders, **late[2]),
-        SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=fades, **late[3]),
+        SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=fades, **{**late[3], "capacity": few}),
     ]
     # a line through two samples extrapolates to anything, so its weight rises later
     doubts = (0.0, 0.0, 0.0, 2.0)

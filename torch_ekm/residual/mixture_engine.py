@@ -20,7 +20,7 @@ from .sparse_gp.engine.loading import load_loops
 def warm_up() -> bool:
     """Load the compiled loops now, not at the first update; returns whether there are any (extra ``fast``).
 
-    A fresh installation compiles them first, for some ten seconds. Without this call another process does so
+    A fresh installation compiles them first, for about a minute. Without this call another process does so
     meanwhile, and torch does the work.
     """
     return load_loops(wait=True) is not None
@@ -60,12 +60,20 @@ class CompiledMixture:
         bound = self._takes(g, x)
         if bound is None:
             return None
-        x, one = x.contiguous(), (*g.batch_shape, g.out_features)
+        x, one, n = x.contiguous(), (*g.batch_shape, g.out_features), len(self._plans)
         two = *one, g.in_features
         shapes = zip(Answer._fields, (one, one, one, one, two, two), strict=True)
         found = Answer(*(x.new_empty(s if name == "mean" or name in wanted else 0) for name, s in shapes))
+        addresses = [t.data_ptr() for t in found]
+        wants = True, any(addresses[1:4]), *map(bool, addresses[4:])
+        shapes = ((n, *s) if want else (0,) for s, want in zip((one, one, two, two), wants, strict=True))
+        told = [x.new_empty(shape) for shape in shapes]  # by each learner
+        each, sizes = [t.data_ptr() for t in told], [8 * t.numel() // n for t in told]
         loops: Any = load_loops()
-        loops.query_mixture(bound.row, self._members, x.data_ptr(), *(t.data_ptr() for t in found))
+        for i, plan in enumerate(self._plans if wants[1] else self._plans[:-1]):
+            at = (begin + i * size for begin, size in zip(each, sizes, strict=True))
+            loops.query_fleet(plan.row, False, x.data_ptr(), *at)
+        loops.mix_fleet(bound.row, self._members, *each, *addresses)
         return found
 
     def learn(self, g: Any, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:

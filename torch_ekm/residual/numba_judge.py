@@ -17,7 +17,8 @@ from . import local_noise as L
 from . import mixture_plan as G
 from .base import FARTHEST as FARTHEST_MEAN
 from .sparse_gp import plan as P
-from .sparse_gp.engine.numba_math import A1, A2, I1, INNER, INT, TINY, F, exp, log, matrix_at, vector_at
+from .sparse_gp.engine.numba_math import exp, log
+from .sparse_gp.engine.numba_memory import A1, A2, I1, INNER, INT, TINY, F, matrix_at, vector_at
 from .tails import LARGEST, MEMORY
 
 _N = len(L.SHARES)

@@ -20,7 +20,11 @@ from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
-from .sparse_gp.engine.numba_math import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
+from .sparse_gp.engine.numba_descent import gather_fleet as gather_fleet
+from .sparse_gp.engine.numba_descent import step_fleet as step_fleet
+from .sparse_gp.engine.numba_memory import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
+from .sparse_gp.engine.numba_rebuild import rebuild_fleet as rebuild_fleet
+from .sparse_gp.engine.numba_units import pool_columns as pool_columns
 
 embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
 
@@ -60,25 +64,20 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
         return -1
     B, d, m, n_learners = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
     far, p, inside = np.empty(g[G.N_EXPERTS]), np.empty(g[G.N_EXPERTS]), np.empty(m)
-    mean, noise, t, found = np.empty(m), np.empty(m), np.empty(m), np.empty(4)
+    mean, noise, found = np.empty(m), np.empty(m), np.empty(4)
     means, noisy, local = np.empty((B * m, n_learners)), np.empty((B * m, n_learners)), np.empty(B * m)
     figures, errors = np.zeros((n_learners + 1, 4, B)), np.zeros((n_learners + 1, B, m))
     events, judged_on = np.zeros((n_learners + 1, B), np.int64), np.empty(B, np.bool_)
     figures[:, 2] = 1.0  # the weight where there is no sample
-    total = 0
-    for i in range(n_learners + 1):
-        total += B * (members[i, P.VALUES] + members[i, P.WIDTH] + 2 * members[i, P.SLOTS] + 1)
-    room, at, alarm = np.empty(total), 0, 0  # what is found for predictions serves the update
+    alarm = 0
     gp.grow_largest(g, on, y)
     for i in range(n_learners + 1):
         a = members[i]
-        n, W, M = a[P.VALUES], a[P.WIDTH], a[P.SLOTS]
-        psi, phi = np.empty(M), np.empty(M)
+        psi, phi = np.empty(a[P.SLOTS]), np.empty(a[P.SLOTS])
         for b in range(B):
-            values, q = room[at : at + n], room[at + n : at + n + W]
-            k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
-            prior = gp.look(a, b, vector_at(x, b, d), values, q, k, psi, phi)
-            v = gp.mean_and_variance(a, b, prior, k, Ck, mean)
+            values, q, k, Ck, prior = gp.room_of(a, b)  # what is found for predictions serves the update
+            prior[0] = gp.look(a, b, vector_at(x, b, d), values, q, k, psi, phi)
+            v = gp.mean_and_variance(a, b, prior[0], k, Ck, mean)
             gp.cut(a, b, mean, inside)
             if i == n_learners:
                 for o in range(m):
@@ -89,8 +88,6 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
                 for o in range(m):
                     means[b * m + o, i] = mean[o]
                     noisy[b * m + o, i] = v * scale[o] * scale[o] + noise[o]
-            room[at + n + W + 2 * M] = prior
-            at += n + W + 2 * M + 1
     for b in range(B):
         count, nis = vector_at(g[G.COUNT], b, 1), 0.0
         judged = on[b] and count[0] >= E.YOUNG
@@ -105,63 +102,51 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
         if on[b]:
             count[0] += 1.0
         of_all[0, b] = nis
-    at = 0
     for i in range(n_learners + 1):
         a, learned, on_ = members[i], y, on
         if i == n_learners:
             learned, on_ = local.ctypes.data, judged_on
             if not alarm >> n_learners & 1:
                 break
-        n, W, M = a[P.VALUES], a[P.WIDTH], a[P.SLOTS]
         for b in range(B):
-            values, q = room[at : at + n], room[at + n : at + n + W]
-            k, Ck = room[at + n + W : at + n + W + M], room[at + n + W + M : at + n + W + 2 * M]
             if on_[b]:
-                prior = room[at + n + W + 2 * M]
-                events[i, b] = gp.learn(
-                    a, b, values, q, k, Ck, prior, vector_at(learned, b, m), t, found, errors[i, b]
-                )
+                events[i, b] = gp.learn(a, b, vector_at(learned, b, m), found, errors[i, b])
                 for r in range(4):
                     figures[i, r, b] = found[r]
-            at += n + W + 2 * M + 1
         if gp.note(a, numbers[i], on_, x, learned, figures[i], errors[i]):
             alarm |= 1 << i
     _of_all(g, figures, events, of_all)
     return alarm
 
 
-@njit(types.void(I1, I2, INT, INT, INT, INT, INT, INT, INT), **COMMON)
-def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
-    """One query per model; results by their addresses (0: not wanted), see ``MixtureResidual``.
+@njit(types.void(I1, I2, INT, INT, INT, INT, INT, INT, INT, INT, INT, INT), **COMMON)
+def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, deviation, standard, J, dv):
+    """One query per model from what its learners say, see ``MixtureResidual``; by addresses (0: not wanted).
 
     Args:
+        means_of, latent_of: means and latent variances of all members, and derivatives.
         variance, deviation: of g.
         standard: deviation of y by which innovations are standardised.
         J, dv: derivatives of mean and variance by x.
     """
     B, d, m, n = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
     n_shares, n_experts = g[G.N_SHARES], g[G.N_EXPERTS]
-    with_variance, rows = variance != 0 or deviation != 0 or standard != 0, m if J else 0
-    rows_dv = m if dv else 0
     h = matrix_at(g[G.EXPERTS], 0, 5, n_experts)[0]
     each = n_experts // (n * n_shares)
     means, latent, noisy = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
-    J_of, dv_of = np.empty((n + 1, rows, d)), np.empty((n, rows_dv, d))
-    one, v, noise, log_factor, none = np.empty(m), np.empty(m), np.zeros(m), np.zeros(m), np.empty((0, d))
+    noise, log_factor, by_x = np.empty(m), np.zeros(m), np.zeros(m)
     for b in range(B):
-        if with_variance:
-            gp.query(members[n], b, False, vector_at(x, b, d), log_factor, v, J_of[n, :rows_dv], none)
-            for o in range(m):
-                share = share_of_noise(g, b * m + o)
-                for j in range(d if rows_dv else 0):
-                    J_of[n, o, j] *= share if abs(log_factor[o]) < L.REACH else 0.0
-                log_factor[o] = share * min(max(log_factor[o], -L.REACH), L.REACH)
         for i in range(n):
-            gp.query(members[i], b, with_variance, vector_at(x, b, d), one, v, J_of[i], dv_of[i])
-            if with_variance:
-                gp.noise_of(members[i], b, noise)
+            told, v = vector_at(means_of, i * B + b, m), vector_at(latent_of, i * B + b, m)
+            gp.noise_of(members[i], b, noise)
             for o in range(m):
-                means[o, i], latent[o, i], noisy[o, i] = one[o], v[o], v[o] + noise[o]
+                means[o, i] = told[o]
+                latent[o, i] = v[o] if latent_of else 0.0
+                noisy[o, i] = latent[o, i] + noise[o]
+        for o in range(m if latent_of else 0):
+            share, f = share_of_noise(g, b * m + o), vector_at(means_of, n * B + b, m)[o]
+            by_x[o] = share if abs(f) < L.REACH else 0.0
+            log_factor[o] = share * min(max(f, -L.REACH), L.REACH)
         for o in range(m):
             r = b * m + o
             make_finite(g, r, means[o], latent[o])
@@ -170,15 +155,14 @@ def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
             value = min(max(free, -most), most)
             vector_at(mean, r, 1)[0] = value
             gain = vector_at(g[G.GAIN], r, n)
-            if rows:
+            if J:
                 to = vector_at(J, r, d)
                 to[:] = 0.0
-                if free == value:
-                    for i in range(n):
-                        for j in range(d):
-                            s = J_of[i, o, j]
-                            to[j] += gain[i] * s if math.isfinite(s) else 0.0
-            if not with_variance:
+                for i in range(n if free == value else 0):
+                    slope = vector_at(J_of, i * B * m + r, d)
+                    for j in range(d):
+                        to[j] += gain[i] * slope[j] if math.isfinite(slope[j]) else 0.0
+            if not latent_of:
                 continue
             mass, shift = vector_at(g[G.MASS], r, n * n_shares), vector_at(g[G.SHIFT], r, n * n_shares)
             spread, total = vector_at(g[G.SPREAD], r, n * n_shares), 0.0
@@ -195,18 +179,17 @@ def query_mixture(g, members, x, mean, variance, deviation, standard, J, dv):
                 vector_at(deviation, r, 1)[0] = math.sqrt(min(total, bound))
             if variance:
                 vector_at(variance, r, 1)[0] = min(total, bound)
-            if rows_dv:
-                to = vector_at(dv, r, d)
+            if dv:
+                to, of_noise = vector_at(dv, r, d), vector_at(J_of, n * B * m + r, d)
                 for j in range(d):
-                    to[j] = 2.0 * bound * J_of[n, o, j] if total > bound else 0.0
+                    to[j] = 2.0 * bound * by_x[o] * of_noise[j] if total > bound else 0.0
                 for k in range(n * n_shares):
                     i, share = k // n_shares, h[k * each]
+                    slope, slope_v = vector_at(J_of, i * B * m + r, d), vector_at(dv_of, i * B * m + r, d)
                     apart = share * means[o, i] + shift[k] - value
                     by_v, by_m = mass[k] * share * share, 2.0 * mass[k] * apart * share
                     if total > bound:
                         by_v, by_m = mass[k] * by_noise, 0.0
                     for j in range(d):
-                        s, f = dv_of[i, o, j], J_of[i, o, j]
-                        to[j] += by_v * (s if math.isfinite(s) else 0.0) + by_m * (
-                            f if math.isfinite(f) else 0.0
-                        )
+                        to[j] += by_v * slope_v[j] if math.isfinite(slope_v[j]) else 0.0
+                        to[j] += by_m * slope[j] if math.isfinite(slope[j]) else 0.0

@@ -28,7 +28,7 @@ class Recent(nn.Module):
         # 1 where a model had a sample; and the weight of its update, 0 of one of another system
         self.on = nn.Buffer(torch.zeros(shape, **options))
         self.weight = nn.Buffer(torch.zeros(shape, **options))
-        self._n_taken = 0  # on the host, as the places are
+        self.n_taken = 0  # on the host, as the places are
 
     def keep(self, n: int, x: Tensor, y: Tensor, on: Tensor | None) -> None:
         """The sample after n of each model, where ``on``; None: of all."""
@@ -57,8 +57,8 @@ class Recent(nn.Module):
         """
         kept = min(n, self.capacity)
         stride = max(kept // k, 1)
-        first = self._n_taken % stride
-        self._n_taken += 1
+        first = self.n_taken % stride
+        self.n_taken += 1
         some = slice(first, min(first + stride * k, kept), stride)
         places = torch.arange(some.start, some.stop, stride, device=self.x.device).to(self.weight.dtype)
         age = (n - 1 - places) % self.capacity + 1
@@ -72,11 +72,11 @@ class Recent(nn.Module):
         """No sample was seen."""
         for buffer in self.buffers():
             buffer.zero_()
-        self._n_taken = 0
+        self.n_taken = 0
 
     def get_extra_state(self) -> dict[str, Any]:
         """Calls so far: they decide what is taken."""
-        return {"n_taken": self._n_taken}
+        return {"n_taken": self.n_taken}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._n_taken = int(state["n_taken"])
+        self.n_taken = int(state["n_taken"])

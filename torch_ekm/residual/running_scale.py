@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,14 +12,14 @@ from .._arrays import is_plain, namespace
 from ..typing import AnyArray, Bool, Float, Tensor
 
 BLOCK = 32  #: samples of a block
-_TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
+TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
 # below this share of what the eighth leaves in, the rest stands still and these are no outliers
-_SPIKES = 0.03
-_CLIP = 5.5  # of the trimmed rms, 3.3 deviations of a normal law
-_BURST_CLIP = 10.0  # times as much for columns whose large samples come in company
-_COMPANY = 0.5  # of what chance would leave alone
-_DOUBT = 2.0  # so many large ones are taken to be alone beforehand
-_REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
+SPIKES = 0.03
+CLIP = 5.5  # of the trimmed rms, 3.3 deviations of a normal law
+BURST_CLIP = 10.0  # times as much for columns whose large samples come in company
+COMPANY = 0.5  # of what chance would leave alone
+DOUBT = 2.0  # so many large ones are taken to be alone beforehand
+REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
 REACH = 10.0  #: scales beyond which z goes no further, in columns where that matters
 ALIEN = 1e-20  #: a variation below this share is no rest either: what was before was wrong
 
@@ -72,7 +73,7 @@ class RunningScale(nn.Module):
         self.spread = nn.Buffer(torch.zeros(shape, **factory))
         self.weight = nn.Buffer(torch.zeros(shape, **factory))
         self.large = nn.Buffer(torch.zeros(*shape, 2, **factory))  # large samples, and those of them alone
-        columns = torch.tensor(shifted or [False] * features, dtype=dtype, device=device)
+        columns = torch.tensor(shifted or [False] * features, **factory)
         self.shifted = nn.Buffer(columns)
         self.cuts = any(grows or ())
         reach = [REACH if cut else math.inf for cut in grows or [False] * features]
@@ -99,26 +100,34 @@ class RunningScale(nn.Module):
         for buffer, found in zip(pooled, _pooled(self, block, on), strict=True):
             buffer.copy_(torch.as_tensor(found))
 
-    def settle(self, *young: Tensor, settled: float = 0.1) -> tuple[Tensor, Tensor]:
+    def settle(self, *young: Tensor, settled: float = 0.1) -> tuple[Tensor, Tensor] | None:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
+
+        None: no change is worth it.
 
         Args:
             young: a block as of :meth:`pool` that counts, too; every change is worth new units then.
             settled: relative change of a scale (of a shift in units of it) that is not worth new units.
         """
-        found = _pooled(self, *young) if young else (self.weight, self.centre, self.spread)
-        weight, centre, spread = map(torch.as_tensor, found[:3])
-        floor = 100 * torch.finfo(spread.dtype).eps * centre.abs()
-        usable = (spread > floor) & (spread > torch.finfo(spread.dtype).tiny)
-        scale = torch.where(usable, spread.maximum(self.least), self._first())
-        off = torch.maximum(scale / self.scale, self.scale / scale) - 1.0
-        off = off + (centre - self.shift).abs() / torch.minimum(scale, self.scale)
+        kept = self.weight, self.centre, self.spread, self.scale, self.shift, self.least
+        # in numpy, see _arrays, where these are numbers alone
+        now: Any = [t.numpy() for t in kept] if is_plain(self.scale) else kept
+        weight, centre, spread = (_pooled(self, *young) if young else now)[:3]
+        (old_scale, old_shift, least), xp = now[3:], namespace(now[0])
+        kind = torch.finfo(self.scale.dtype)
+        usable = (spread > 100 * kind.eps * abs(centre)) & (spread > kind.tiny)
+        first = xp.where(least > 0, least, 1.0)
+        scale = xp.where(usable, xp.maximum(spread, least), first)
+        off = xp.maximum(scale / old_scale, old_scale / scale) - 1.0
+        off = off + abs(centre - old_shift) / xp.minimum(scale, old_scale)
         change = (weight > 0) & (off > (0.0 if young else settled))
-        scale, shift = torch.where(change, scale, self.scale), torch.where(change, centre, self.shift)
-        offset, ratio = (self.shift - shift) / self.scale, self.scale / scale
-        self.shift.copy_(shift)
-        self.scale.copy_(scale)
-        return offset, ratio
+        if xp is np and not change.any():
+            return None
+        scale, shift = xp.where(change, scale, old_scale), xp.where(change, centre, old_shift)
+        offset, ratio = (old_shift - shift) / old_scale, old_scale / scale
+        for buffer, value in ((self.shift, shift), (self.scale, scale)):
+            buffer.copy_(torch.as_tensor(value))
+        return torch.as_tensor(offset), torch.as_tensor(ratio)
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """What comes decides alone on these models' scales; until then they are what they were."""
@@ -191,7 +200,7 @@ def _pooled(scale: RunningScale, block: Tensor, on: Tensor) -> tuple[AnyArray, .
     at = SimpleNamespace(memory=scale.memory, **dict(zip(("block", "block_on", *names), kept, strict=True)))
     xp, tiny = namespace(at.block), torch.finfo(block.dtype).tiny
     count, centre, spread, large = _of_block(at, tiny)
-    share, *drop = _REST[0], *(xp.asarray(value, dtype=xp.float32) for value in (_REST[1], 1.0))
+    share, *drop = REST[0], *(xp.asarray(value, dtype=at.block.dtype) for value in (REST[1], 1.0))
     past = xp.where((spread == 0) | (spread > ALIEN * at.spread), at.spread, 0.0)
     count = count * xp.where(spread < share * past, *drop)
     before = xp.where(past == at.spread, at.weight.clip(None, at.memory), 0.0)
@@ -221,12 +230,12 @@ def _of_block(at: SimpleNamespace, tiny: float) -> tuple[AnyArray, ...]:
     squares = _sorted(xp.where(on, away**2, xp.inf))
     few, many = (
         (xp.where(kept, squares, 0.0).sum(-2) / kept.sum(-2).clip(1)) ** 0.5
-        for kept in (rank < n - xp.ceil(n / part) for part in _TRIMMED)
+        for kept in (rank < n - xp.ceil(n / part) for part in TRIMMED)
     )
-    typical = xp.where(many > _SPIKES * few, many, few)
-    bound = xp.where(typical > 0, _CLIP * typical, 1.0)
+    typical = xp.where(many > SPIKES * few, many, few)
+    bound = xp.where(typical > 0, CLIP * typical, 1.0)
     large, bursts = _in_company(at, abs(away) > bound[..., None, :], count)
-    bound = (bound * xp.where(bursts, _BURST_CLIP, 1.0))[..., None, :]
+    bound = (bound * xp.where(bursts, BURST_CLIP, 1.0))[..., None, :]
     away = xp.minimum(xp.maximum(away, -bound), bound)
     n = count.clip(1.0)
     mean = (away.sum(-2) / n) * at.shifted
@@ -244,7 +253,7 @@ def _in_company(at: SimpleNamespace, large: AnyArray, count: AnyArray) -> tuple[
     counts = at.large * (1.0 - BLOCK / at.memory) + found
     share = counts[..., 0] / (at.weight.clip(None, at.memory) + count).clip(1.0)
     by_chance = (1.0 - share.clip(None, 1.0)) ** 2
-    return counts, counts[..., 1] + _DOUBT < _COMPANY * by_chance * (counts[..., 0] + _DOUBT)
+    return counts, counts[..., 1] + DOUBT < COMPANY * by_chance * (counts[..., 0] + DOUBT)
 
 
 def _sorted(x: AnyArray) -> AnyArray:

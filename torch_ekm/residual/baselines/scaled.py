@@ -140,10 +140,13 @@ class ScaledLearner(ResidualLearner):
             self._learn_block(n)
         elif (n + 1) % BLOCK == 0:
             units.pool(recent.x, recent.y, recent.on)
-            changes = units.input.settle(settled=self.settled), units.output.settle(settled=self.settled)
-            ratios = torch.cat([changes[0][1], changes[1][1]], dim=-1).log().abs()
-            if bool((ratios > 0).any() or (changes[0][0] != 0).any() or (changes[1][0] != 0).any()):
-                self._follow(*changes)
+            pairs = [
+                one.settle(settled=self.settled) or (torch.zeros_like(one.scale), torch.ones_like(one.scale))
+                for one in (units.input, units.output)
+            ]
+            ratios = torch.cat([ratio for _, ratio in pairs], dim=-1).log().abs()
+            if bool((ratios > 0).any() or (pairs[0][0] != 0).any() or (pairs[1][0] != 0).any()):
+                self._follow(*pairs)
             far = (ratios > _FAR).any(-1)
             if bool(far.any()):  # what was learned so far was of another order
                 self._learn_block(BLOCK - 1, far)

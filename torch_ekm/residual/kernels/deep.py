@@ -8,7 +8,7 @@ import torch
 from ..._checks import check_count, check_counts
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-from .kernel import BufferList, Kernel, Pullback
+from .kernel import BufferList, Kernel
 from .stationary import StationaryKernel, squared_distances
 
 _INITIAL_SCALE = 0.3  # of the features at the start, relative to an ordinary initialisation
@@ -81,26 +81,6 @@ class DeepKernel(Kernel):
         a = self.embed(x)
         d2 = squared_distances(a, a if z is x else self.embed(z))
         return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2)
-
-    @torch.no_grad()
-    def with_pullback(self, x: Tensor, rows: int) -> tuple[Tensor, Tensor, Pullback]:
-        values, (*hidden, last) = [x], self.weights
-        for weight, bias in zip(hidden, self.biases, strict=True):
-            values.append((values[-1] @ weight).add_(bias.unsqueeze(-2)).tanh_())
-        w = self.base.log_lengthscale.neg().exp().unsqueeze(-2)
-        K, diagonal, back = self.base.of_embedded(torch.cat([x * w, values[-1] @ last], dim=-1), rows)
-
-        def pullback(by_matrix: Tensor, by_diagonal: Tensor) -> list[Tensor]:
-            by_lengthscale, by, by_variance = back(by_matrix, by_diagonal)
-            weights, biases = [values[-1].mT @ by], []
-            for i in range(len(values) - 1, 0, -1):
-                by = (by @ self.weights[i].mT).mul_(1.0 - values[i].square())
-                weights.insert(0, values[i - 1].mT @ by)
-                biases.insert(0, by.sum(-2))
-            network = zip([*self.weights, *self.biases], weights + biases, strict=True)
-            return [by_lengthscale, by_variance, *(by.sum_to_size(p.shape) for p, by in network)]
-
-        return K, diagonal, pullback
 
     def diagonal(self, x: Tensor) -> Tensor:
         return self.base.diagonal(x)

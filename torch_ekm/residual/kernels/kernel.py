@@ -8,9 +8,8 @@ optimiser would leave its caches stale).
 
 from __future__ import annotations
 
-import copy
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import cast
 
 import torch
@@ -20,9 +19,6 @@ from ..._checks import check_kind
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-
-#: derivatives by :meth:`Kernel.hyperparameters` from those by ``k(x_i, x_j)`` and ``k(x_i, x_i)``
-Pullback = Callable[[Tensor, Tensor], Sequence[Tensor | None]]
 
 
 class Kernel(Recorded, nn.Module, ABC):
@@ -54,25 +50,6 @@ class Kernel(Recorded, nn.Module, ABC):
     def diagonal_gradient(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
         """d k(x, x)/dx of one point per model; 0 here, where the same prior variance holds everywhere."""
         return torch.zeros_like(x)
-
-    def with_pullback(
-        self, x: Float[Tensor, "*batch n d"], rows: int
-    ) -> tuple[Float[Tensor, "*batch rows n"], Float[Tensor, "*batch n"], Pullback]:
-        """``k(x_i, x_j)`` of the first points with all, ``k(x_i, x_i)``, and how derivatives go back.
-
-        Here by autograd; a kernel with a closed form overrides it.
-        """
-        twin = copy.deepcopy(self)  # another thread may query the kernel itself
-        parameters = [p.requires_grad_(True) for p in twin.hyperparameters().values()]
-        with torch.enable_grad():
-            found = twin(x[..., :rows, :], x), twin.diagonal_of_set(x)
-
-        def pullback(by_matrix: Tensor, by_diagonal: Tensor) -> Sequence[Tensor | None]:
-            if not parameters:
-                return ()
-            return torch.autograd.grad(found, parameters, [by_matrix, by_diagonal], allow_unused=True)
-
-        return found[0].detach(), found[1].detach(), pullback
 
     def vector(self, x: Float[Tensor, "*any d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
         """k(x, z_j) for one query per model, ``(*batch, m)``; further axes go in front."""

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 
 from ..._checks import check_count
 from ...typing import Float, Tensor
-from .kernel import Kernel, Pullback, log_parameter
+from .kernel import Kernel, log_parameter
 
 
 def squared_distances(x: Float[Tensor, "*any n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
@@ -78,36 +78,6 @@ class StationaryKernel(Kernel):
         w = self.log_lengthscale.neg().exp().unsqueeze(-2)
         d2 = squared_distances(x * w, z * w)
         return self.log_variance.exp()[..., None, None] * self.phi(d2)
-
-    @torch.no_grad()
-    def with_pullback(self, x: Tensor, rows: int) -> tuple[Tensor, Tensor, Pullback]:
-        near = x * self.log_lengthscale.neg().exp().unsqueeze(-2)
-        K, diagonal, back = self.of_embedded(near, rows)
-        return K, diagonal, lambda *by: back(*by)[::2]  # there are no further columns
-
-    def of_embedded(
-        self, a: Float[Tensor, "*batch n e"], rows: int
-    ) -> tuple[Tensor, Tensor, Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]]:
-        """See :meth:`with_pullback`, for points that were scaled; they may have further columns.
-
-        With ``D = dloss/dd2 = -1/2 v psi dloss/dk`` the loss has the derivative ``2 (r_i a_i - D a)`` by a
-        point, r the sums of D's rows. Derivatives are by log L, by the further columns and by log v.
-        """
-        a = a - a[..., :1, :]  # see squared_distances
-        few, v, d = a[..., :rows, :], self.log_variance.exp()[..., None, None], self.log_lengthscale.shape[-1]
-        phi, psi = self.phi_psi(squared_distances(few, a))
-        K, diagonal = phi.mul_(v) if phi is not psi else v * phi, v.squeeze(-1).expand(a.shape[:-1])
-
-        def back(by_matrix: Tensor, by_diagonal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            D = (by_matrix * psi).mul_(-v)  # twice
-            by = D.sum(-2).unsqueeze(-1) * a - D.mT @ few
-            by[..., :rows, :] += D.sum(-1, keepdim=True) * few - D @ a
-            by_lengthscale = -(by[..., :d] * a[..., :d]).sum(-2)
-            by_variance = (by_matrix * K).sum((-2, -1)) + (by_diagonal * diagonal).sum(-1)
-            own = by_lengthscale.sum_to_size(self.log_lengthscale.shape)
-            return own, by[..., d:], by_variance.sum_to_size(self.log_variance.shape)
-
-        return K, diagonal, back
 
     def diagonal(self, x: Tensor) -> Tensor:
         return self.log_variance.exp().expand(x.shape[:-1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -18,13 +19,18 @@ from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import RobustWeight
 from .part import Host, Part
 from .prequential_loss import PrequentialLoss, Queries
+from .units import Standardize
 
 _REPLAYED = 4  # samples of the memory per sample of the window, in each step; at least as many as points
+BETAS = 0.9, 0.99  # of Adam
 # Adam's first step on parameters that are no logarithms: a deep kernel's weights
-_NETWORK_RATE = 0.015
+NETWORK_RATE = 0.015
 # the part of these that goes with each step, times the noise's share of y (and shrinking as steps do):
 # features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
-_NETWORK_DECAY = 0.25
+NETWORK_DECAY = 0.25
+LEAST, LEAST_NOISE, MOST = -7.0, -14.0, 7.0  # of logarithms: far beyond what standardised data can mean
+PARTS = 0.45, 1.0  #: of its samples after which the parts of a step end
+_SHORT = 8  # samples between two rebuilds from which on a step leaves the last one out
 
 
 class LearnHyperparameters(Part):
@@ -32,7 +38,8 @@ class LearnHyperparameters(Part):
 
         loss(theta) = mean_t -log p(y_t | x_t, (Omega, h)_{t0}, theta),   t = t0+1 .. t0+k
 
-    at every rebuild of the caches, k = ``refresh_every``. The k samples were not seen by the state of k
+    before every rebuild of the caches, k = ``refresh_every``, less the last sample: of one model a step is
+    made in parts, each with another sample. The k samples were not seen by the state of k
     samples ago, so the loss cannot be won by overfitting (:class:`PrequentialLoss`). Memory: one copy of the
     state and k samples. The streaming variational bound needs as much and is a worse objective: it inflates
     the noise.
@@ -49,8 +56,8 @@ class LearnHyperparameters(Part):
 
     Args:
         rate: Adam's first step on the logarithms of the hyperparameters.
-        steps: gradient steps per rebuild, spread over the samples up to it; the last one starts where the
-            others lead.
+        steps: gradient steps per rebuild, spread over the samples up to it; each starts where those before
+            lead.
         memory: samples of the past to learn from, too (at least 32); 0: the last k only. Not with
             :class:`ProcessNoise`: where g wanders the past is another g.
 
@@ -66,7 +73,7 @@ class LearnHyperparameters(Part):
         self.steps, self.memory = check_count("steps", steps), check_count("memory", memory, least=0)
 
     def bind(self, learner: Host) -> None:
-        """A window, a copy of the state, Adam's moments and a memory."""
+        """A window, a copy of the state and of the parameters, Adam's moments and a memory."""
         if self.memory and learner.part(ProcessNoise) is not None:
             valid = "0 with ProcessNoise: the past is that of another g"
             raise ParameterError("memory of LearnHyperparameters", self.memory, valid)
@@ -74,109 +81,140 @@ class LearnHyperparameters(Part):
         factor = 1.0 if fading is None else fading.factor
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
+        self.lead = int(self.window >= _SHORT)
         self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
-        parameters = [*learner.kernel.hyperparameters().values(), learner.log_noise_variance]
-        self.adam = Adam(parameters, betas=(0.9, 0.99))
-        for i, p in enumerate(parameters):
-            self.register_buffer(f"move_{i}", torch.zeros_like(p.detach()))
+        # where steps lead to; kernel and noise follow at the next rebuild: until then the caches are theirs
+        self.kernel = copy.deepcopy(learner.kernel).requires_grad_(False)
+        self.log_noise = nn.Buffer(learner.log_noise_variance.detach().clone())
+        self.adam = Adam(self.ahead().values(), betas=BETAS)
         # no more than what a learner remembers that forgets
         known = self.memory if factor == 1.0 else min(self.memory, math.ceil(1.0 / (1.0 - factor)))
-        size = max(self.window, known, learner.recent.capacity)
+        size = max(self.window + self.lead, known, learner.recent.capacity)
         fleet = {"batch_shape": fleet, "dtype": like.dtype, "device": like.device}
         learner.recent = Recent(learner.in_features, learner.out_features, size, **fleet)
-        self._n_rebuilt = 0
+        self._leads = False
+        #: samples that the past state has seen; changes of it, and of where steps begin
+        self.since = 0, 0
 
     def act(self, learner: Host) -> None:
         """Descend, and move the parameters, when it is time."""
-        place = (learner.n_samples - learner.refresh_offset) % self.window
-        due = learner.is_due(learner.n_samples + 1)
-        between = (place + 1) * self.steps // self.window > place * self.steps // self.window
-        if due or (between and place + 1 < self.window):
-            if moved := due and self.steps > 1:
-                self._move(learner)
-            self.descend(learner, moved=moved)
-        if due:
-            self._move(learner)
+        n = learner.n_samples + 1
+        if self._is_due(learner, n):
+            self.descend(learner)
+        elif learner.engine is not None and self.lead and self.memory:
+            for ahead in range(1, len(PARTS)):  # a large step in parts
+                if self._is_due(learner, n + ahead):
+                    learner.engine.descend(learner, self, n + ahead, PARTS[-1 - ahead])
+        if self._leads and learner.is_due(n):
+            for p, ahead in zip(self.theta(learner).values(), self.ahead().values(), strict=True):
+                p.copy_(ahead)
+            self._leads = False
+
+    def _is_due(self, learner: Host, n: int) -> bool:
+        """Whether there is a step after n samples."""
+        place, window = (n + self.lead - learner.refresh_offset - 1) % self.window, self.window
+        if place == window - 1:
+            return learner.is_due(n + self.lead)
+        return (place + 1) * self.steps // window > place * self.steps // window
 
     def after_rebuild(self, learner: Host) -> None:
         """The present state becomes the past one, which has seen all samples so far."""
         self.loss.snapshot(learner.posterior)
-        self._n_rebuilt = learner.n_samples
+        units = learner.part(Standardize)  # new ones while they are rough: steps still lead where they led
+        self._begin(learner.n_samples, self._leads and units is not None and units.is_rough(learner))
+
+    def _begin(self, n_rebuilt: int, leads: bool = False) -> None:
+        self.since, self._leads = (n_rebuilt, self.since[1] + 1), leads
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models face another system: the state of the old one does not count."""
         self.loss.state.forget(models)
+        self._begin(self.since[0], self._leads)
 
     def reset(self) -> None:
         """Forget snapshot and step sizes."""
-        super().reset()
+        self.n_steps.zero_()
         self.adam.reset()
         self.loss.state.reset()
-        self._n_rebuilt = 0
+        self._begin(0)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Samples that the past state has seen."""
-        return {"n_rebuilt": self._n_rebuilt}
+        """Samples that the past state has seen, and whether steps lead away from it."""
+        return {"n_rebuilt": self.since[0], "leads": self._leads}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self._n_rebuilt = int(state["n_rebuilt"])
+        self._begin(int(state["n_rebuilt"]), bool(state["leads"]))
 
     def queries(self, learner: Host, n: int) -> Queries:
         """Of n samples those since the past state, and this turn's part of those that it has seen."""
         recent = learner.recent
-        x, y, _, weight = recent.last(n, min(max(n - self._n_rebuilt, 0), self.window))
+        x, y, _, weight = recent.last(n, min(max(n - self.since[0], 0), self.window))
         absorbed = age = x.new_zeros(x.shape[-2])
         if self.memory:
-            k = max(_REPLAYED * self.window, learner.posterior.capacity)
-            x_past, y_past, weight_past, age_past = recent.take(n, k)
-            seen = (age_past > n - self._n_rebuilt).to(age_past.dtype)
+            x_past, y_past, weight_past, age_past = recent.take(n, self.replayed(learner))
+            seen = (age_past > n - self.since[0]).to(age_past.dtype)
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
+            seen = seen * (age_past < recent.capacity)  # the oldest one's place may be taken
             weight = torch.cat([weight, weight_past * seen], dim=-1)
             absorbed, age = torch.cat([absorbed, torch.ones_like(age_past)]), torch.cat([age, age_past])
         return Queries(*learner.units.of_sets(x, y), weight, absorbed, age)
 
-    def _theta(self, learner: Host) -> dict[str, Tensor]:
+    def replayed(self, learner: Host) -> int:
+        """Samples of the memory in a step."""
+        return max(_REPLAYED * self.window, learner.posterior.capacity) if self.memory else 0
+
+    def theta(self, learner: Host) -> dict[str, Tensor]:
+        """What is learned, by name."""
         return {**learner.kernel.hyperparameters(), "log_noise": learner.log_noise_variance}
 
-    def descend(self, learner: Host, *, moved: bool = False) -> None:
-        """A step of Adam on the loss, model by model; one without samples or finite gradient stays as it is.
+    def ahead(self) -> dict[str, Tensor]:
+        """Where steps lead to, by name."""
+        return {**self.kernel.hyperparameters(), "log_noise": self.log_noise}
 
-        The parameters move at the next rebuild: until then the caches are those of the old ones. ``moved``:
-        those of the past state are to be made again.
-        """
-        kernel, log_noise, parameters = learner.kernel, learner.log_noise_variance, self._theta(learner)
-        queries = self.queries(learner, learner.n_samples + 1)
-        _, gradients = self.loss.with_gradients(kernel, log_noise, queries, anew=moved)
+    def start(self, learner: Host) -> bool:
+        """Before a step: it starts where the last ones lead. Whether they lead away from the caches."""
+        if not self._leads:
+            for ahead, p in zip(self.ahead().values(), self.theta(learner).values(), strict=True):
+                ahead.copy_(p)
+        return self._leads
+
+    def descend(self, learner: Host) -> None:
+        """A step of Adam on the loss, model by model; without samples or a finite gradient it stays."""
+        n = learner.n_samples + 1
+        if learner.engine is None or not learner.engine.descend(learner, self, n, PARTS[-1]):
+            self._descend(learner, n)
+        self._begin(self.since[0], True)
+
+    def _descend(self, learner: Host, n: int) -> None:
+        anew, queries = self.start(learner), self.queries(learner, n)
+        kernel, log_noise = copy.deepcopy(self.kernel), self.log_noise.clone()
+        parameters = [p.requires_grad_(True) for p in (*kernel.hyperparameters().values(), log_noise)]
+        with torch.enable_grad():
+            loss = self.loss(kernel, log_noise, queries, anew=anew).sum()
+            gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         on = ((queries.weight * (1.0 - queries.absorbed)).sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on
-        n = self.n_steps.clamp_min(1.0)
-        correction, decay = self.adam.correction(n) * _shrink(n), _NETWORK_DECAY * _shrink(n)
-        decay = decay * on * parameters["log_noise"].mean(-1).exp().clamp_max(1.0)
-        alone = on.is_cpu and not on.dim() and bool(on)  # one model, which needs no masks
-        if alone := alone and all(g is None or bool(g.isfinite().all()) for g in gradients):
-            correction, decay = float(correction), float(decay)
-        for i, ((name, p), gradient) in enumerate(zip(parameters.items(), gradients, strict=True)):
+        n_steps = self.n_steps.clamp_min(1.0)
+        correction, decay = self.adam.correction(n_steps) * _shrink(n_steps), NETWORK_DECAY * _shrink(n_steps)
+        decay = decay * on * self.log_noise.mean(-1).exp().clamp_max(1.0)
+        for i, ((name, p), gradient) in enumerate(zip(self.ahead().items(), gradients, strict=True)):
             if gradient is None:
                 continue
-            logarithm = name.split(".")[-1].startswith("log_")
-            shared = self.shared_kernel and name != "log_noise"
-            good = None if alone else gradient.isfinite() & (_spread(on, p, shared) > 0)
-            rate = (self.rate if logarithm else _NETWORK_RATE) * _spread(correction, p, shared)
-            move = self.get_buffer(f"move_{i}")
+            shared, logarithm = self.shared_kernel and name != "log_noise", is_logarithm(name)
+            good = gradient.isfinite() & (_spread(on, p, shared) > 0)
             if not logarithm:
-                move.sub_(_spread(decay, p, shared) * p)
-            self.adam.move(i, move, gradient if good is None else gradient.where(good, 0.0), rate, good)
+                p.sub_(_spread(decay, p, shared) * p)
+            step = (self.rate if logarithm else NETWORK_RATE) * _spread(correction, p, shared)
+            self.adam.move(i, p, gradient.where(good, 0.0), step, good)
+            if logarithm:
+                p.clamp_(LEAST_NOISE if name == "log_noise" else LEAST, MOST)
 
-    def _move(self, learner: Host) -> None:
-        """The parameters as the steps since the last rebuild want them."""
-        for i, (name, p) in enumerate(self._theta(learner).items()):
-            move = self.get_buffer(f"move_{i}")
-            p.add_(move)
-            move.zero_()
-            if name.split(".")[-1].startswith("log_"):  # far beyond what standardised data can mean
-                p.clamp_(-14.0 if name == "log_noise" else -7.0, 7.0)
+
+def is_logarithm(name: str) -> bool:
+    """Whether a parameter of that name is one; a network's are not."""
+    return name.split(".")[-1].startswith("log_")
 
 
 def _shrink(n: Tensor) -> Tensor:
@@ -184,10 +222,8 @@ def _shrink(n: Tensor) -> Tensor:
     return (1.0 + n / 30.0).rsqrt().clamp_min(0.1)
 
 
-def _spread(value: Float[Tensor, "*batch"] | float, like: Tensor, shared: bool) -> Tensor | float:
+def _spread(value: Float[Tensor, "*batch"], like: Tensor, shared: bool) -> Tensor:
     """A value per model against a parameter; one shared by the fleet takes the mean."""
-    if not isinstance(value, Tensor):
-        return value
     if shared or like.shape[: value.dim()] != value.shape:
         return value.mean()
     return value[(..., *(None,) * (like.dim() - value.dim()))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import nn
@@ -45,6 +45,7 @@ class Host(ResidualLearner):
     recent: Recent
     refresh_every: int
     refresh_offset: int
+    engine: Any
     n_samples: int
     """Samples before the present one."""
     pending: Tensor
@@ -106,8 +107,9 @@ class Host(ResidualLearner):
         """
         for part in self._parts:
             part.on_rebuild(self)
+        if self.engine is None or not self.engine.rebuild(self):
+            self.posterior.rebuild(self.kernel, self.shared_noise())
         self.pending.zero_()
-        self.posterior.rebuild(self.kernel, self.shared_noise())
         for part in self._parts:
             part.after_rebuild(self)
 

@@ -16,10 +16,18 @@ from __future__ import annotations
     BASIS, ACTIVE, COUNT, SLOT, MOMENTS, VECTORS, PENDING, LARGEST, LOG_NOISE,
     LOG_LENGTHSCALE, LOG_VARIANCE, LOG_ACTION, SHIFT, SCALE, SHIFT_Y, SCALE_Y, REACH,
     EMBEDDED,  # the basis as the kernel sees it
-    LAYERS, WIDTHS, WEIGHTS,  # of a deep kernel's network
+    LAYERS, NETWORK,  # of a deep kernel: rows of widths before and behind a layer, addresses of weights,
+    # biases (0: the last layer has none) and weights the other way round
+    ROOM,  # for what an update finds of its sample
     RECENT_X, RECENT_Y, RECENT_ON, RECENT, RECENT_SIZE,  # of the last samples, with weights
     DISTRUSTED,  # RobustWeight
     FACTOR,  # CalibrateNoise
     CHANGED, LEVELS, MISLED,  # DetectChanges
+    N_STEPS,  # LearnHyperparameters
+    LEARNING,  # samples of the window, of the memory in a step; parameters, entries of their gradient
+    PARAMETERS,  # rows of addresses of one and Adam's moments, size, place in the gradient, 1 (noise: 2) if
+    # it is a logarithm
+    SUMS,  # of the queries of a step so far
+    RATES,  # of a step, square of a robust weight's threshold (0: none), factor of forgetting
     FIELDS,
-) = range(42)  # fmt: skip
+) = range(47)  # fmt: skip

@@ -98,26 +98,18 @@ class SparsePosterior(nn.Module):
 
     def gram(self, kernel: Kernel) -> Float[Tensor, "*batch slots slots"]:
         """K(X, X) with ``jitter k**`` on the diagonal; the identity at free slots. Differentiable."""
-        return self.as_gram(kernel(self.basis, self.basis), kernel.diagonal_of_set(self.basis))
-
-    def as_gram(
-        self, K: Float[Tensor, "*batch slots slots"], diagonal: Float[Tensor, "*batch slots"]
-    ) -> Float[Tensor, "*batch slots slots"]:
-        """See :meth:`gram`; K is the kernel between the basis and itself, which has that diagonal."""
         on = self.active.unsqueeze(-1)
-        K = K * (on * on.mT)
-        diagonal = torch.where(self.active > 0, diagonal * (1.0 + self.jitter), 1.0)
+        K = kernel(self.basis, self.basis) * (on * on.mT)
+        diagonal = kernel.diagonal_of_set(self.basis) * (1.0 + self.jitter)
+        diagonal = torch.where(self.active > 0, diagonal, 1.0)
         return (0.5 * (K + K.mT)).diagonal_scatter(diagonal, dim1=-2, dim2=-1)
 
+    @torch.no_grad()
     def rebuild(self, kernel: Kernel, s2: Float[Tensor, "*batch"]) -> None:
         """alpha, C, Q from the natural form by Cholesky."""
-        self.rebuild_from(self.gram(kernel), s2)
-
-    def rebuild_from(self, K: Float[Tensor, "*batch slots slots"], s2: Float[Tensor, "*batch"]) -> None:
-        """The same, with the kernel's matrix at hand (see :meth:`gram`)."""
         s2 = s2[..., None, None]
         on = self.active.unsqueeze(-1)
-        Q, C, alpha = posterior_from_natural(K, self.precision / s2, self.information / s2)
+        Q, C, alpha = posterior_from_natural(self.gram(kernel), self.precision / s2, self.information / s2)
         # a free slot has K = 1, so Q = 1 there: it must be 0 like the rest of its row
         self.covariance.copy_(C)
         torch.mul(Q, on * on.mT, out=self.moments.select(-3, 1))

@@ -264,9 +264,6 @@ class SparseOnlineGP(Host):
 
     def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
         """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
-        done = None if self.engine is None else self.engine.project(self, x, y, on)
-        if done is not None:
-            return done
         z, t = self.units.input(x), self.units.output(y)
         return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
 

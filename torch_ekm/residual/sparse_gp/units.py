@@ -11,6 +11,7 @@ from ...typing import Tensor
 from ..running_scale import ALIEN, BLOCK, RunningScale, Units
 from .part import Host, Part
 
+_AHEAD = 3  # samples by which a block ends before a rebuild, so that both do not fall on one
 _DOUBLING = 1024  # samples up to which units are adopted after 1, 2, 4, 8, ... samples, too
 
 
@@ -96,20 +97,25 @@ class Standardize(Part):
             self._adopt(learner)
 
     def _pool(self, learner: Host) -> None:
-        """Blocks end with the 32nd sample, and just before each rebuild from then on."""
-        n, offset = learner.n_samples + 1, learner.refresh_offset % BLOCK
+        """Blocks end with the 32nd sample, and three samples before each rebuild from then on."""
+        n, offset = learner.n_samples + 1, (learner.refresh_offset - _AHEAD) % BLOCK
         if n == BLOCK or (n > BLOCK and (n - offset) % BLOCK == 0):
             size = offset if offset and n == BLOCK + offset else BLOCK
-            learner.units.pool(*learner.recent.last(n, size)[:3])
+            block = learner.recent.last(n, size)[:3]
+            if learner.engine is None or not learner.engine.pool(learner, *block):
+                learner.units.pool(*block)
 
     def _adopt(self, learner: Host, *young: Tensor) -> None:
         posterior, units = learner.posterior, learner.units
-        offset, ratio = units.input.settle(*young[::2])
-        offset_t, ratio_t = units.output.settle(*young[1:])
-        alien = (torch.cat([ratio, ratio_t], dim=-1) > 1.0 / ALIEN).any(-1)
-        if alien.is_cuda or bool(alien.any()):  # what is of another size would stay for good
-            posterior.forget(alien)
-        posterior.basis.add_(offset.unsqueeze(-2)).mul_(ratio.unsqueeze(-2))
-        if self.output_offset == "learned":
-            posterior.information.add_(posterior.precision.sum(-1, keepdim=True) * offset_t.unsqueeze(-2))
-        posterior.information.mul_(ratio_t.unsqueeze(-2))
+        change, change_t = units.input.settle(*young[::2]), units.output.settle(*young[1:])
+        alien = [ratio > 1.0 / ALIEN for _, ratio in filter(None, (change, change_t))]
+        models = torch.cat(alien, dim=-1).any(-1) if alien else None
+        if models is not None and (models.is_cuda or bool(models.any())):  # it would stay for good
+            posterior.forget(models)
+        if change is not None:
+            posterior.basis.add_(change[0].unsqueeze(-2)).mul_(change[1].unsqueeze(-2))
+        if change_t is not None:
+            if self.output_offset == "learned":
+                added = posterior.precision.sum(-1, keepdim=True) * change_t[0].unsqueeze(-2)
+                posterior.information.add_(added)
+            posterior.information.mul_(change_t[1].unsqueeze(-2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from itertools import chain
+from itertools import chain, zip_longest
 from operator import is_
 from typing import Any
 
@@ -20,7 +20,7 @@ from ...kernels.linear import LinearKernel
 from ...kernels.stationary import Matern32, SquaredExponential
 from .. import plan as P
 from ..forgetting import ForgettingFactor, ProcessNoise
-from ..hyperparameters import LearnHyperparameters
+from ..hyperparameters import LearnHyperparameters, is_logarithm
 from ..monitor import CalibrateNoise, DetectChanges, RobustWeight
 from ..part import Host, Part
 from ..units import Standardize
@@ -83,35 +83,52 @@ class Plan(Bound):
 
     def __init__(self, gp: Host) -> None:
         super().__init__()
-        self.units, self.changes = gp.part(Standardize), gp.part(DetectChanges)
-        self.learning = gp.part(LearnHyperparameters)
+        self.units, self.changes, self.learning = map(
+            gp.part, (Standardize, DetectChanges, LearnHyperparameters)
+        )
+        changing = [one for one in gp._parts if type(one).on_rebuild is not Part.on_rebuild]
+        last = changing[-1] if changing else None
+        #: of ProcessNoise, where nothing else changes the natural form after it
+        self.share = last.share if isinstance(last, ProcessNoise) else 0.0
+        self.begun: tuple[Any, float] = None, 0.0  # a step in parts: which one, and how far
         self.shape = tuple(gp.batch_shape)
         self.one, self.two = (*self.shape, gp.out_features), (*self.shape, gp.out_features, gp.in_features)
         self.all = np.ones(math.prod(self.shape), np.bool_)
-        fields = self._fields(gp)
-        tensors = [value for value in fields.values() if isinstance(value, Tensor)]
+        fields, learned = self._fields(gp), () if self.learning is None else self.learning.buffers()
         self.parameters = tuple(gp.kernel.hyperparameters().values())
-        used = set(map(id, (*tensors, *self.parameters)))
+        tensors = [value for value in fields.values() if isinstance(value, Tensor)]
+        tensors += [*gp.units.buffers(), *learned, *self.parameters]
+        used = set(map(id, tensors))
         owners = (one for one in gp.modules() if not used.isdisjoint(map(id, one.buffers(recurse=False))))
         own = *owners, *(one for one in gp.kernel.modules() if one._parameters)
         self.watch(own, gp._modules, moved=(*self.parameters, gp.log_noise_variance))
-        self.reason = _reason(gp, [*tensors, *self.parameters])
+        self.reason = _reason(gp, tensors)
         self.usable = not self.reason
         if not self.usable:
             return
-        for field, value in fields.items():
-            self.row[field] = value.data_ptr() if isinstance(value, Tensor) else value
-        widths = [gp.in_features]
-        if isinstance(gp.kernel, DeepKernel):
-            *hidden, last = gp.kernel.weights
-            layers = [p for pair in zip(hidden, gp.kernel.biases, strict=True) for p in pair] + [last, last]
-            widths += [weight.shape[-1] for weight in gp.kernel.weights]
-            self.row[P.LAYERS], self.row[P.WIDTHS] = len(widths) - 1, self.own(np.array(widths))
-            self.row[P.WEIGHTS] = self.own(np.array([p.data_ptr() for p in layers]))
-        width = widths[0] + (widths[-1] if len(widths) > 1 else 0)
-        self.row[P.WIDTH], self.row[P.VALUES] = width, sum(widths)
-        self.row[P.EMBEDDED] = self.own(np.empty((len(self.all), gp.posterior.capacity + 1, width)))
+        self.row = self._row(gp.kernel, fields)
+        self.row[P.ROOM] = self.own(
+            np.empty((len(self.all), self.row[[P.VALUES, P.WIDTH]].sum() + 2 * self.row[P.SLOTS] + 1))
+        )
         self._basis, self._marks = gp.posterior.basis, [-1]
+        if self.learning is not None:
+            self.past = self._of_learning(gp, self.learning, fields)
+
+    def _row(self, kernel: Kernel, fields: dict[int, Any]) -> np.ndarray:
+        """Sizes and addresses of a state with that kernel."""
+        row = np.zeros(P.FIELDS, np.int64)
+        for field, value in {**fields, **(_known(kernel) or {})}.items():
+            row[field] = value.data_ptr() if isinstance(value, Tensor) else value
+        layers = []
+        if isinstance(kernel, DeepKernel):
+            for weight, bias in zip_longest(kernel.weights, kernel.biases):
+                addresses = weight.data_ptr(), 0 if bias is None else bias.data_ptr()
+                layers.append([*weight.shape[-2:], *addresses, self.own(np.empty(weight.numel()))])
+        row[P.LAYERS], row[P.NETWORK] = len(layers), self.own(np.array(layers, np.int64))
+        row[P.WIDTH] = row[P.IN] + (layers[-1][1] if layers else 0)
+        row[P.VALUES] = row[P.IN] + sum(layer[1] for layer in layers)
+        row[P.EMBEDDED] = self.own(np.empty((len(self.all), row[P.SLOTS], row[P.WIDTH])))
+        return row
 
     def _fields(self, gp: Host) -> dict[int, Any]:
         posterior, recent, x, y = gp.posterior, gp.recent, gp.units.input, gp.units.output
@@ -127,7 +144,6 @@ class Plan(Bound):
             P.SHIFT: x.shift, P.SCALE: x.scale, P.SHIFT_Y: y.shift, P.SCALE_Y: y.scale, P.REACH: x.reach,
             P.RECENT_X: recent.x, P.RECENT_Y: recent.y, P.RECENT_ON: recent.on, P.RECENT: recent.weight,
             P.RECENT_SIZE: recent.capacity,
-            **(_known(gp.kernel) or {}),
         }  # fmt: skip
         if robust is not None:
             fields[P.DISTRUSTED] = robust.level
@@ -137,6 +153,33 @@ class Plan(Bound):
             level, misled = self.changes.level, self.changes.misled.level
             fields |= {P.CHANGED: level, P.LEVELS: self.changes.levels, P.MISLED: misled}
         return fields
+
+    def _of_learning(self, gp: Host, learning: LearnHyperparameters, fields: dict[int, Any]) -> np.ndarray:
+        """Of the past state, of which the loss is, with the parameters that steps lead to."""
+        loss, past = learning.loss, learning.loss.state
+        figures = np.array([learning.rate, (loss.robust or 0.0) ** 2, loss.forgetting_factor])
+        row = self._row(learning.kernel, {
+            **fields, P.BASIS: past.basis, P.ACTIVE: past.active, P.MOMENTS: past.moments,
+            P.VECTORS: past.vectors, P.LOG_NOISE: learning.log_noise, P.N_STEPS: learning.n_steps,
+            P.RATES: self.own(figures),
+        })  # fmt: skip
+        d, own = gp.in_features, len(self.all) if row[P.OWN] else 1
+        states = row[[P.LOG_LENGTHSCALE, P.LOG_ACTION, P.LOG_VARIANCE]].tolist()
+        places, at, rows = dict(zip(states, (0, d - int(row[P.ACTIONS]), d), strict=True)), d + 1, []
+        if isinstance(learning.kernel, DeepKernel):
+            pairs = zip_longest(learning.kernel.weights, learning.kernel.biases)
+            for p in filter(lambda p: p is not None, chain.from_iterable(pairs)):
+                places[p.data_ptr()], at = at, at + p.numel() // own
+        places[learning.log_noise.data_ptr()] = at
+        for i, (name, p) in enumerate(learning.ahead().items()):
+            size, noise = p.numel() // (len(self.all) if name == "log_noise" else own), name == "log_noise"
+            moments = (learning.adam.get_buffer(f"{order}_{i}").data_ptr() for order in ("first", "second"))
+            rows.append([p.data_ptr(), *moments, size, places[p.data_ptr()], is_logarithm(name) + noise])
+        M, m, n = row[P.SLOTS], gp.out_features, at + gp.out_features
+        row[P.LEARNING] = self.own(np.array([learning.window, learning.replayed(gp), len(rows), n]))
+        row[P.PARAMETERS] = self.own(np.array(rows))
+        row[P.SUMS] = self.own(np.empty((len(self.all), M * (2 * M + m + row[P.WIDTH]) + n + 3)))
+        return row
 
     def is_rough(self, gp: Host) -> bool:
         """Whether a part changes the state before the present sample is learned."""

@@ -19,7 +19,9 @@ _SOURCES = (
     "**/numba_*.py",
     "**/*plan.py",
     "sparse_gp/monitor.py",
+    "sparse_gp/hyperparameters.py",
     "**/recursion.py",
+    "running_scale.py",
     "experts.py",
     "local_noise.py",
     "tails.py",
@@ -30,7 +32,7 @@ _OFF = (
     "NUMBA_CACHE_DIR to a folder that can be written"
 )
 _FIRST_TIME = (
-    "a process in the background compiles loops, once and for some ten seconds; until then torch does the "
+    "a process in the background compiles loops, once and for about a minute; until then torch does the "
     "work, and results may differ by rounding. torch_ekm.warm_up() waits for them"
 )
 

@@ -14,55 +14,24 @@ from ...base import FARTHEST
 from ...misled import MISLED_RATE, WORSE
 from .. import plan as P
 from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, RING_SIZE, Z90_SQUARED
-from .numba_kernels import absorb, kernel_row, kernel_slopes, times
-from .numba_math import (
-    A1,
-    A2,
-    COMMON,
-    I1,
-    INNER,
-    INT,
-    ON,
-    F,
-    exp,
-    integers_at,
-    matrix_at,
-    stack_at,
-    vector_at,
-)
-from .numba_network import network, network_slopes
-
-
-@njit(types.void(I1, INT, A1, A1), **INNER)
-def _embed(p, own, values, q):
-    """``q``: z as the kernel sees it, in its lengthscales and with a network's features behind.
-
-    ``values`` begins with z and takes each layer of the network, ``own`` is the place of the kernel.
-    """
-    d, n_s = p[P.IN], p[P.IN] - p[P.ACTIONS]
-    log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, n_s)
-    for j in range(n_s):
-        q[j] = values[j] * exp(-log_lengthscale[j])
-    for j in range(n_s, d):
-        q[j] = values[j]
-    if p[P.LAYERS] > 0:
-        widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        network(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values)
-        features = p[P.WIDTH] - d
-        for j in range(features):
-            q[d + j] = values[values.shape[0] - features + j]
+from .numba_kernels import embed, kernel_row, kernel_slopes, network_back, turn_weights
+from .numba_math import exp
+from .numba_memory import A1, A2, COMMON, I1, INNER, INT, ON, F, integers_at, matrix_at, vector_at
+from .numba_recursion import absorb, times
 
 
 @njit(types.void(I1), **COMMON)
 def embed_fleet(p):
     """The bases as the kernels see them, after torch has changed them or the kernels."""
-    d, M, W = p[P.IN], p[P.SLOTS], p[P.WIDTH]
-    values = np.empty(p[P.VALUES])
-    for i in range(p[P.MODELS] * M):
-        z = vector_at(p[P.BASIS], i, d)
-        for j in range(d):
-            values[j] = z[j]
-        _embed(p, i // M * p[P.OWN], values, vector_at(p[P.EMBEDDED], i, W))
+    d, M = p[P.IN], p[P.SLOTS]
+    values = np.empty((M, p[P.VALUES]))
+    for b in range(p[P.MODELS]):
+        basis = matrix_at(p[P.BASIS], b, M, d)
+        turn_weights(p, b * p[P.OWN])
+        for i in range(M):
+            for j in range(d):
+                values[i, j] = basis[i, j]
+        embed(p, b * p[P.OWN], values, matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH]))
 
 
 @njit(F(I1, INT, A1, A1, A1, A1, A1, A1), **INNER)
@@ -76,12 +45,9 @@ def look(p, b, x, values, q, k, psi, phi):
     reach = vector_at(p[P.REACH], 0, d)
     for j in range(d):
         values[j] = min(max((x[j] - shift[j]) / scale[j], -reach[j]), reach[j])
-    _embed(p, own, values, q)
-    n_a, basis = p[P.ACTIONS], matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
-    return kernel_row(
-        p[P.KIND], n_a, q, basis, vector_at(p[P.ACTIVE], b, M), vector_at(p[P.LOG_VARIANCE], own, 1)[0],
-        vector_at(p[P.LOG_ACTION], own, n_a), k, psi, phi,
-    )  # fmt: skip
+    embed(p, own, values.reshape(1, values.shape[0]), q.reshape(1, q.shape[0]))
+    basis = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
+    return kernel_row(p, own, q, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi)
 
 
 @njit(F(I1, INT, F, A1, A1, A1), **INNER)
@@ -115,6 +81,16 @@ def cut(p, b, mean, inside):
         mean[o] = min(max(mean[o], -most), most)
 
 
+@njit(F(I1, INT), **INNER)
+def shared_noise(p, b):
+    """See ``Host.shared_noise``."""
+    m, total = p[P.OUT], 0.0
+    log_noise = vector_at(p[P.LOG_NOISE], b, m)
+    for o in range(m):
+        total += log_noise[o]
+    return math.exp(total / m)
+
+
 @njit(types.void(I1, INT, A1), **INNER)
 def noise_of(p, b, noise):
     """Observation noise of each output in squared units of y, as calibrated."""
@@ -128,58 +104,6 @@ def noise_of(p, b, noise):
             noise[o] *= math.exp(factor[o])
 
 
-@njit(types.void(I1, INT, types.boolean, A1, A1, A1, A2, A2), **INNER)
-def query(p, b, with_variance, x, mean, variance, J, dv):
-    """One query of model b: mean, latent variance and, where J and dv have rows, their derivatives.
-
-    ``variance`` and ``dv`` are those of a unit output scale in their first entry and row.
-    """
-    d, m, M, W = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH]
-    n_a, own = p[P.ACTIONS], b * p[P.OWN]
-    values, q, inside = np.empty(p[P.VALUES]), np.empty(W), np.empty(m)
-    k, psi, Ck = np.empty(M), np.empty(M), np.empty(M)
-    phi = np.empty(M if n_a > 0 else 0)
-    prior = look(p, b, x, values, q, k, psi, phi)
-    v = mean_and_variance(p, b, prior, k, Ck, mean)
-    cut(p, b, mean, inside)
-    scale_y = vector_at(p[P.SCALE_Y], b, m)
-    if with_variance:
-        for o in range(m):
-            variance[o] = v * scale_y[o] * scale_y[o]
-    if J.shape[0] == 0:
-        return
-    rows = m + 1 if dv.shape[0] > 0 else m
-    alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
-    left, slopes = np.empty((M, rows)), np.empty((rows, W))
-    for i in range(M):
-        for o in range(m):
-            left[i, o] = alpha[i, o]
-        for o in range(m, rows):
-            left[i, o] = 2.0 * Ck[i]
-    log_action = vector_at(p[P.LOG_ACTION], own, n_a)
-    kernel_slopes(q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, log_action, left, slopes)
-    for o in range(m, rows):  # k(x, x) of an action-linear kernel
-        log_variance = vector_at(p[P.LOG_VARIANCE], own, 1)[0]
-        for j in range(n_a):
-            slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
-    log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d - n_a)
-    for j in range(d - n_a):
-        by_q = exp(-log_lengthscale[j])
-        for r in range(rows):
-            slopes[r, j] *= by_q
-    if p[P.LAYERS] > 0:
-        widths = integers_at(p[P.WIDTHS], 0, p[P.LAYERS] + 1)
-        network_slopes(widths, integers_at(p[P.WEIGHTS], 0, 2 * p[P.LAYERS]), own, values, slopes)
-    scale, reach = vector_at(p[P.SCALE], b, d), vector_at(p[P.REACH], 0, d)
-    for j in range(d):
-        by_x = 1.0 / scale[j] if abs(values[j]) < reach[j] else 0.0
-        for o in range(m):
-            J[o, j] = slopes[o, j] * scale_y[o] * by_x * inside[o]
-        for o in range(m, rows):
-            for to in range(m):
-                dv[to, j] = slopes[o, j] * scale_y[to] * scale_y[to] * by_x
-
-
 @njit(types.void(I1, types.boolean, INT, INT, INT, INT, INT), **COMMON)
 def query_fleet(p, noisy, x, mean, variance, J, dv):
     """One query per model, all given by their addresses (0: not wanted), see ``SparseOnlineGP``.
@@ -187,50 +111,84 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
     Args:
         noisy: whether the variance is that of y.
     """
-    d, m = p[P.IN], p[P.OUT]
-    noise = np.empty(m)
+    d, m, M, W, n_a = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH], p[P.ACTIONS]
+    values, q, inside, noise = np.empty(p[P.VALUES]), np.empty(W), np.empty(m), np.zeros(m)
+    k, psi, Ck, phi = np.empty(M), np.empty(M), np.empty(M), np.empty(M if n_a > 0 else 0)
+    rows = (m + 1 if dv else m) if J else 0
+    left, slopes, by = np.empty((M, rows)), np.empty((rows, W)), np.empty((rows, W - d))
+    reach = vector_at(p[P.REACH], 0, d)
     for b in range(p[P.MODELS]):
-        v = vector_at(variance, b, m)
-        query(
-            p, b, variance != 0, vector_at(x, b, d), vector_at(mean, b, m), v,
-            matrix_at(J, b, m if J else 0, d), matrix_at(dv, b, m if dv else 0, d),
-        )  # fmt: skip
+        own, mean_ = b * p[P.OWN], vector_at(mean, b, m)
+        prior = look(p, b, vector_at(x, b, d), values, q, k, psi, phi)
+        v = mean_and_variance(p, b, prior, k, Ck, mean_)
+        cut(p, b, mean_, inside)
+        scale, scale_y = vector_at(p[P.SCALE], b, d), vector_at(p[P.SCALE_Y], b, m)
         if noisy:
             noise_of(p, b, noise)
+        for o in range(m if variance else 0):
+            vector_at(variance, b, m)[o] = v * scale_y[o] * scale_y[o] + noise[o]
+        if rows == 0:
+            continue
+        alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
+        for i in range(M):
             for o in range(m):
-                v[o] += noise[o]
+                left[i, o] = alpha[i, o]
+            for o in range(m, rows):
+                left[i, o] = 2.0 * Ck[i]
+        kernel_slopes(p, own, q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, left, slopes)
+        log_variance, log_action = (
+            vector_at(p[P.LOG_VARIANCE], own, 1)[0],
+            vector_at(p[P.LOG_ACTION], own, n_a),
+        )
+        for o in range(m, rows):  # k(x, x) of an action-linear kernel
+            for j in range(n_a):
+                slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
+        log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d - n_a)
+        for j in range(d - n_a):
+            by_q = exp(-log_lengthscale[j])
+            for r in range(rows):
+                slopes[r, j] *= by_q
+        if d < W:
+            for r in range(rows):
+                for j in range(W - d):
+                    by[r, j] = slopes[r, d + j]
+            network_back(p, own, values.reshape(1, values.shape[0]), by, slopes, np.empty(0))
+        for j in range(d):
+            by_x = 1.0 / scale[j] if abs(values[j]) < reach[j] else 0.0
+            for o in range(m):
+                matrix_at(J, b, m, d)[o, j] = slopes[o, j] * scale_y[o] * by_x * inside[o]
+            for o in range(m, rows):
+                for to in range(m):
+                    matrix_at(dv, b, m, d)[to, j] = slopes[o, j] * scale_y[to] * scale_y[to] * by_x
 
 
-@njit(INT(I1, INT, A1, A1, A1, A1, F, A1, A1, A1, A1), **INNER)
-def learn(p, b, values, q, k, Ck, prior, y, t, figures, error):
-    """Learn the sample whose k, k(x, x) and Ck are at hand; returns the event. ``t``: room for y in units."""
-    d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
-    shift, scale = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m)
-    log_noise, log_s2 = vector_at(p[P.LOG_NOISE], b, m), 0.0
-    for o in range(m):
-        t[o] = (y[o] - shift[o]) / scale[o]
-        log_s2 += log_noise[o]
-    slot = integers_at(p[P.SLOT], b, 1)
-    basis = matrix_at(p[P.BASIS], b, M, d)
-    for j in range(d):
-        basis[slot[0], j] = values[j]
-    embedded = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
-    for j in range(q.shape[0]):
-        embedded[slot[0], j] = q[j]
-    constants = vector_at(p[P.FIGURES], 0, 3)
-    return absorb(
-        t, prior, math.exp(log_s2 / m), k, Ck, vector_at(p[P.ACTIVE], b, M), integers_at(p[P.COUNT], b, 1),
-        slot, stack_at(p[P.MOMENTS], b, 3, M, M), stack_at(p[P.VECTORS], b, 2, M, m),
-        constants[2], vector_at(p[P.DISTRUSTED], b, 1), constants[0], constants[1], figures, error,
+@njit(types.UniTuple(A1, 5)(I1, INT), **INNER)
+def room_of(p, b):
+    """What an update of model b finds: z with all layers, and as the kernel sees it, k, Ck, k(x, x)."""
+    n, W, M = p[P.VALUES], p[P.WIDTH], p[P.SLOTS]
+    at = p[P.ROOM] + 8 * b * (n + W + 2 * M + 1)
+    k = at + 8 * (n + W)
+    return (
+        vector_at(at, 0, n), vector_at(at + 8 * n, 0, W), vector_at(k, 0, M), vector_at(k, 1, M),
+        vector_at(k + 16 * M, 0, 1),
     )  # fmt: skip
 
 
-@njit(types.void(INT, INT, A1), **INNER)
-def write(address, at, values):
-    """To the place ``at`` of a list of such vectors."""
-    to = vector_at(address, at, values.shape[0])
-    for j in range(values.shape[0]):
-        to[j] = values[j]
+@njit(INT(I1, INT, A1, A1, A1), **INNER)
+def learn(p, b, y, figures, error):
+    """Learn the sample whose k, k(x, x) and Ck are in the room; returns the event."""
+    d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
+    values, q, k, Ck, prior = room_of(p, b)
+    shift, scale, t = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m), np.empty(m)
+    for o in range(m):
+        t[o] = (y[o] - shift[o]) / scale[o]
+    slot, basis = integers_at(p[P.SLOT], b, 1)[0], matrix_at(p[P.BASIS], b, M, d)
+    for j in range(d):
+        basis[slot, j] = values[j]
+    embedded = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
+    for j in range(q.shape[0]):
+        embedded[slot, j] = q[j]
+    return absorb(p, b, prior[0], shared_noise(p, b), k, Ck, t, figures, error)
 
 
 @njit(types.void(I1, ON, INT), **INNER)
@@ -265,15 +223,15 @@ def changed(p, n, on, y, figures, errors):
 
 @njit(types.boolean(I1, INT, ON, INT, INT, A2, A2), **INNER)
 def note(p, n, on, x, y, figures, errors):
-    """All notes of the sample after n (-1: none) per model; whether a model faces another system."""
-    if n < 0:
-        return False
+    """All notes of the sample after n per model; whether a model faces another system."""
     d, m = p[P.IN], p[P.OUT]
     grow_largest(p, on, y)
     for b in range(p[P.MODELS]):
         one, at = 1.0 if on[b] else 0.0, b * p[P.RECENT_SIZE] + n % p[P.RECENT_SIZE]
-        write(p[P.RECENT_X], at, vector_at(x, b, d))
-        write(p[P.RECENT_Y], at, vector_at(y, b, m))
+        for kept, new, width in ((p[P.RECENT_X], x, d), (p[P.RECENT_Y], y, m)):
+            to, values = vector_at(kept, at, width), vector_at(new, b, width)
+            for j in range(width):
+                to[j] = values[j]
         vector_at(p[P.RECENT_ON], at, 1)[0] = one
         vector_at(p[P.RECENT], at, 1)[0] = figures[2, b] * one
         vector_at(p[P.PENDING], b, 1)[0] += one
@@ -299,28 +257,27 @@ def are_finite(p, x, y):
     return math.isfinite(total)
 
 
-@njit(INT(I1, INT, ON, INT, INT, A2, I1, A2), **COMMON)
-def update_fleet(p, n, on, x, y, figures, event, errors):
-    """The sample after n (-1: without notes) per model where ``on``, given by addresses.
+@njit(INT(I1, INT, ON, INT, INT, A2, I1), **COMMON)
+def update_fleet(p, n, on, x, y, figures, event):
+    """The sample after n per model where ``on``, given by addresses.
 
     Returns:
         1 where a model faces another system, else 0; -1: a sample is not finite, and nothing was done.
 
     Args:
         figures: novelty, nis, weight and latent variance of each model; as they are where not ``on``.
-        errors: innovations ``(models, out)``, in the learner's units.
     """
     if not are_finite(p, x, y):
         return -1
     d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
-    values, q, t = np.empty(p[P.VALUES]), np.empty(p[P.WIDTH]), np.empty(m)
-    k, psi, Ck, phi, found = np.empty(M), np.empty(M), np.empty(M), np.empty(M), np.empty(4)
+    psi, phi, found, errors = np.empty(M), np.empty(M), np.empty(4), np.empty((on.shape[0], m))
     for b in range(p[P.MODELS]):
         if not on[b]:
             continue
-        prior = look(p, b, vector_at(x, b, d), values, q, k, psi, phi)
+        values, q, k, Ck, prior = room_of(p, b)
+        prior[0] = look(p, b, vector_at(x, b, d), values, q, k, psi, phi)
         times(matrix_at(p[P.MOMENTS], 3 * b, M, M), k, Ck)
-        event[b] = learn(p, b, values, q, k, Ck, prior, vector_at(y, b, m), t, found, errors[b])
+        event[b] = learn(p, b, vector_at(y, b, m), found, errors[b])
         for r in range(4):
             figures[r, b] = found[r]
     return int(note(p, n, on, x, y, figures, errors))

@@ -1,49 +1,19 @@
-"""What compiled loops are made of: types and options, memory at an address, exponential and logarithm.
+"""exp, log and products in compiled loops.
 
-The functions of this module vectorise where they stand in a loop, as those of the C library do not.
+They vectorise where they stand in a loop, as those of the C library do not.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import carray, njit, types
-from numba.extending import intrinsic
+from numba import njit, types
 
-EPS, TINY = np.finfo(np.float64).eps, np.finfo(np.float64).tiny
-# NaN and infinity keep their meaning: samples are tested for them in compiled loops
-COMMON = {
-    "cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy",
-    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-}  # fmt: skip
-INNER = {**COMMON, "no_cpython_wrapper": True}  # called from loops alone
+from .numba_memory import A1, A2, INNER, INT, F, made
+
 _EXACT = {**INNER, "fastmath": {"contract"}}  # sums in the order in which they stand
-A1, A2, A3 = (types.Array(types.float64, n, "C") for n in (1, 2, 3))
-I1, I2, F, INT = (
-    types.Array(types.int64, 1, "C"),
-    types.Array(types.int64, 2, "C"),
-    types.float64,
-    types.int64,
-)
-ON = types.boolean[::1]
-
 _TO_INTEGER = 6755399441055744.0  # 1.5 * 2^52: its last bits are those of what was added
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10
 _MANTISSA, _ONE = 0xFFFFFFFFFFFFF, 0x3FF0000000000000  # bits of a double: the last 52, and those of 1.0
-
-
-made: Any = intrinsic  # which passes the context itself
-
-
-@made
-def _pointer(context, address):
-    """An address as a pointer."""
-
-    def generate(context, builder, signature, args):
-        return builder.inttoptr(args[0], context.get_value_type(types.voidptr))
-
-    return types.voidptr(types.int64), generate
 
 
 @made
@@ -64,30 +34,6 @@ def _bits(context, value):
         return builder.bitcast(args[0], context.get_value_type(types.int64))
 
     return types.int64(types.float64), generate
-
-
-@njit(inline="always")
-def vector_at(address, b, n):
-    """The b-th n doubles at an address."""
-    return carray(_pointer(address + 8 * b * n), (n,), np.float64)
-
-
-@njit(inline="always")
-def matrix_at(address, b, n, m):
-    """The b-th matrix ``(n, m)`` of doubles at an address."""
-    return carray(_pointer(address + 8 * b * n * m), (n, m), np.float64)
-
-
-@njit(inline="always")
-def stack_at(address, b, r, n, m):
-    """The b-th r matrices."""
-    return carray(_pointer(address + 8 * b * r * n * m), (r, n, m), np.float64)
-
-
-@njit(inline="always")
-def integers_at(address, b, n):
-    """The b-th n integers at an address."""
-    return carray(_pointer(address + 8 * b * n), (n,), np.int64)
 
 
 @njit(F(F), **_EXACT)
@@ -134,3 +80,60 @@ def log(y):
     p = p * q + 0.2
     p = p * q + 1.0 / 3.0
     return e * 0.6931471805599453 + 2.0 * s * (p * q + 1.0)
+
+
+@njit(F(A1, A1, INT), **INNER)
+def dot(a, b, n):
+    """Of the first n entries."""
+    total = 0.0
+    for k in range(n):
+        total += a[k] * b[k]
+    return total
+
+
+@njit(types.void(A2, A2, F, A2, types.boolean, types.boolean), **INNER)
+def add_products(A, B, a, out, lower, upper):
+    """``out += a A B'``, four rows by two at a time: each number that is read serves two to four sums.
+
+    What a row of ``out`` gains is the same to the last bit whatever other rows there are.
+
+    Args:
+        lower: only what lies on and below the diagonal (and a little above).
+        upper: A is an upper triangle.
+    """
+    n, m, K, sums = A.shape[0], B.shape[0], A.shape[1], np.empty((2, 4))
+    for i in range(0, n, 4):
+        rows, end, k0 = min(4, n - i), min(m, i + 4) if lower else m, i if upper else 0
+        a0, a1, a2, a3 = (
+            A[i, k0:],
+            A[min(i + 1, n - 1), k0:],
+            A[min(i + 2, n - 1), k0:],
+            A[min(i + 3, n - 1), k0:],
+        )
+        for j in range(0, end, 2):
+            b, c = B[j, k0:], B[min(j + 1, m - 1), k0:]
+            s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
+            for k in range(K - k0):
+                s0 += a0[k] * b[k]
+                s1 += a1[k] * b[k]
+                s2 += a2[k] * b[k]
+                s3 += a3[k] * b[k]
+                t0 += a0[k] * c[k]
+                t1 += a1[k] * c[k]
+                t2 += a2[k] * c[k]
+                t3 += a3[k] * c[k]
+            sums[0, 0], sums[0, 1], sums[0, 2], sums[0, 3] = s0, s1, s2, s3
+            sums[1, 0], sums[1, 1], sums[1, 2], sums[1, 3] = t0, t1, t2, t3
+            for r in range(rows):
+                for s in range(min(2, end - j)):
+                    out[i + r, j + s] += a * sums[s, r]
+
+
+@njit(A2(A2), **INNER)
+def transposed(A):
+    """A', in memory of its own."""
+    out = np.empty((A.shape[1], A.shape[0]))
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[j, i] = A[i, j]
+    return out
