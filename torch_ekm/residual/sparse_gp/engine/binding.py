@@ -83,9 +83,8 @@ class Plan(Bound):
 
     def __init__(self, gp: Host) -> None:
         super().__init__()
-        self.units, self.changes, self.learning = map(
-            gp.part, (Standardize, DetectChanges, LearnHyperparameters)
-        )
+        self.units, self.changes = gp.part(Standardize), gp.part(DetectChanges)
+        self.learning = gp.part(LearnHyperparameters)
         changing = [one for one in gp._parts if type(one).on_rebuild is not Part.on_rebuild]
         last = changing[-1] if changing else None
         #: of ProcessNoise, where nothing else changes the natural form after it
