@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import importlib
 import subprocess
 import sys
 
@@ -332,6 +333,14 @@ def test_a_fresh_installation_learns_while_another_process_compiles(monkeypatch)
     assert used(gp, lambda: gp(x[1]), pytest.MonkeyPatch())
     assert_alike(reference, gp, x, float(y.abs().max()))
     assert len(started) == 1
+
+
+@numba_here
+def test_loops_that_are_compiled_are_not_compiled_again():
+    assert loading._is_cached()
+    loops = importlib.import_module(loading._LAST)
+    own = [name for name, one in vars(loops).items() if getattr(one, "__module__", "") == loops.__name__]
+    assert own[-1] == loading._LAST_LOOP
 
 
 @numba_here

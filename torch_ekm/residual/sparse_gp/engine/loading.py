@@ -15,6 +15,7 @@ from ...._warnings import warn
 from ....exceptions import SpeedWarning
 
 _LAST = "torch_ekm.residual.numba_mixture"  #: of the modules of loops, which imports the others
+_LAST_LOOP = "mix_fleet"  #: of that module: what is compiled last
 _SOURCES = (
     "**/numba_*.py",
     "**/*plan.py",
@@ -109,4 +110,4 @@ def _is_cached() -> bool:
         found = found - {index}
         with contextlib.suppress(OSError):
             index.unlink()
-    return any("query_mixture" in index.name for index in found)
+    return any(f".{_LAST_LOOP}-" in index.name for index in found)
