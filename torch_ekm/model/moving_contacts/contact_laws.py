@@ -15,7 +15,7 @@ Mask = NDArray[np.bool_]
 _TOLERANCE = 1e-10  # of the residual [N m, rad]
 _NEWTON = 10  # iterations before splitting takes over
 _SPLITTING = 40  # iterations between two attempts of Newton's method
-_ROUNDS = 20
+_ROUNDS = 10  # of 4,660 equilibria all but 10 are found in so many; what has none takes them all
 _SHORTEST = 0.05  # share of a Newton step at which the line search gives up
 # weights of gaps against forces [N m/rad], without influence on the answer; splitting takes them in turn
 _RHO_NEWTON, _RHO_SPLITTING = 0.1, (1.0, 1.0, 3.0, 0.3)
