@@ -17,13 +17,14 @@ from ..typing import Tensor
 from .bands import DEVIATIONS, Band, Bands, lets_go
 from .decision import Decision, StopReason, Waypoint
 from .focus import FocusedPose, PoseTarget
-from .rehearsal import LONGEST, End, PathEnd, Rehearsal
+from .rehearsal import LONGEST, End, PathEnd, Rehearsal, is_loose
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from .controller import LookAndMoveController
     from .knowledge import HandKnowledge
+    from .model_hand import ModelHand
 
 _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
 _BACK = 1.5  # times off_rotation from which an object that is farther off is not turned back: it slips out
@@ -163,14 +164,14 @@ class WholeTurn:
             whole: the path goes on where it is not safe.
             longest: way of an actuator in the whole movement [rad].
         """
-        focus = controller.focus
+        focus, hand = controller.focus, None
         if firm:
-            decision = self._grip(controller, seen, knowledge, firm)
+            decision, hand = self._grip(controller, seen, knowledge, firm)
             if decision is not None:
                 return Plan(target, focus, seen.state, decision)
         off = focus.off_rotation(target.error(seen.state))
         most = max(self.off_rotation, min(off, _BACK * self.off_rotation))
-        rehearsal = Rehearsal(controller, seen, target, self.piece, longest)
+        rehearsal = Rehearsal(controller, seen, target, self.piece, longest, hand=hand)
         bands, spare = Bands(controller, knowledge, seen, target), rehearsal.hand.margin
         waypoints: list[Waypoint] = []
         asked = focus.error(target, seen.state)
@@ -226,27 +227,26 @@ class WholeTurn:
 
     def _grip(
         self, controller: LookAndMoveController, seen: Observation, knowledge: HandKnowledge, firm: float
-    ) -> Decision | None:
+    ) -> tuple[Decision | None, ModelHand | None]:
         """The movement that grips as the object needs it, as far as it is safe; None: it is gripped so, or
-        grips no better."""
+        grips no better. And the hand of the model, if it still stands where it began."""
         here = PoseTarget(seen.position, seen.rotation)
-        rehearsal = Rehearsal(controller, seen, None, self.piece)
+        rehearsal = Rehearsal(controller, seen, None, self.piece, firm=firm)
         bands = Bands(controller, knowledge, seen, here)
         waypoints: list[Waypoint] = []
         for piece, state in rehearsal.pieces():
-            if not waypoints and not _loose(rehearsal.first, firm):
-                return None
             waypoint = Waypoint(piece, state, bands.add(piece, state))
             if len(waypoints) == _GRIP or self._off(waypoint.band, self.off_rotation):
                 break
             waypoints.append(waypoint)
         if waypoints:
-            return dataclasses.replace(_joined(controller, seen, waypoints, rehearsal), turns=False)
-        if rehearsal.hand.failure is None:
-            return None
+            return dataclasses.replace(_joined(controller, seen, waypoints, rehearsal), turns=False), None
+        hand = rehearsal.hand
+        if hand.failure is None:
+            return None, None if hand.time else hand
         decision = controller.decide(seen.state, seen.a, here, seen.fingertip_force)  # the model refuses
-        loose = decision.status is StopReason.RUNNING and _loose(decision, firm)
-        return dataclasses.replace(decision, turns=False) if loose else None
+        loose = decision.status is StopReason.RUNNING and is_loose(decision, firm)
+        return dataclasses.replace(decision, turns=False) if loose else None, None
 
     def _first_order(
         self, controller: LookAndMoveController, seen: Observation, target: PoseTarget
@@ -283,9 +283,3 @@ def _joined(
         grip=None if first is None else first.grip,
         band=waypoints[-1].band,
     )
-
-
-def _loose(first: Decision | None, firm: float) -> bool:
-    """The grip before anything moves is less than that share of what is wanted, or a finger's is weak."""
-    grip = None if first is None else first.grip
-    return grip is not None and (grip.weak or float(grip.force.max()) < firm * grip.wanted)

@@ -75,6 +75,8 @@ class Rehearsal:
         target: where the object shall be; None: it stays where it is, and is gripped as it should be.
         piece: largest step [rad].
         longest: way of an actuator [rad].
+        firm: share of the wanted grip with which nothing is gripped.
+        hand: which stands there already.
     """
 
     def __init__(
@@ -84,11 +86,16 @@ class Rehearsal:
         target: PoseTarget | None,
         piece: float,
         longest: float = LONGEST,
+        *,
+        firm: float = math.inf,
+        hand: ModelHand | None = None,
     ) -> None:
-        self._controller, self._target, self._longest = controller, target, longest
+        self._controller, self._target, self._longest, self._firm = controller, target, longest, firm
         self._limiting = LimitingFunction(gain=1.0, step=piece, contact_travel=None)
         model = controller.kinematic if controller.enhanced is None else controller.enhanced
-        self.hand = ModelHand(model, seen.state, seen.a, seen.fingertip_force, controller.forces)
+        if hand is None:
+            hand = ModelHand(model, seen.state, seen.a, seen.fingertip_force, controller.forces)
+        self.hand = hand
         self._measures, self._idle = seen.fingertip_force is not None, set(self.hand.at_limits())
         self.first: Decision | None = None
         """The first one, with the grip before anything moves."""
@@ -111,8 +118,9 @@ class Rehearsal:
                 self._most = self._bears(lin)
             lin = controller.corrected(lin)
             self.last = decision = self._decide(here, force, lin)
-            self.first = self.first or decision
-            if decision.status is not StopReason.RUNNING or (self._target is None and _gripped(decision)):
+            begins, self.first = self.first is None, self.first or decision
+            firm = _gripped(decision) or (begins and not is_loose(decision, self._firm))
+            if decision.status is not StopReason.RUNNING or (self._target is None and firm):
                 return
             way = way + decision.delta_a
             self._too_long = float(way.abs().max()) > self._longest
@@ -185,6 +193,12 @@ class Rehearsal:
 def _gripped(decision: Decision) -> bool:
     grip = decision.grip
     return grip is None or (float(grip.force.max()) >= _GRIPPED * grip.wanted and not grip.weak)
+
+
+def is_loose(decision: Decision, firm: float) -> bool:
+    """The grip before anything moves is less than that share of what is wanted, or a finger's is weak."""
+    grip = decision.grip
+    return grip is not None and (grip.weak or float(grip.force.max()) < firm * grip.wanted)
 
 
 def _bearing(hand: ModelHand) -> list[str]:
