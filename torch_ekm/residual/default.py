@@ -57,8 +57,6 @@ def default_learner(
     common: dict[str, Any] = {
         "capacity": capacity, "standardize": units, "refresh_every": every, **options
     }  # fmt: skip
-    # of functions linear in x as many points say all
-    few = min(capacity, d + 1) if type(d) is type(capacity) is int else capacity
     # no two rebuilds fall together, nor one and the step that a deep kernel takes halfway between its own
     late: list[dict[str, Any]] = [{**common, "refresh_offset": offset} for offset in (0, 12, 6, 5)]
     fleet = fleet_options(options)
@@ -68,8 +66,10 @@ def default_learner(
         DeepKernelSOGP(d, m, base=_long(d, fleet), parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
         DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[1]),
         SparseOnlineGP(d, m, parts=wanders, **late[2]),
-        SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=fades, **{**late[3], "capacity": few}),
     ]
+    # of functions linear in x as many points say all
+    few = {**late[3], "capacity": min(capacity, d + 1)}
+    members.append(SparseOnlineGP(d, m, kernel=LinearKernel(d, **fleet), parts=fades, **few))
     # a line through two samples extrapolates to anything, so its weight rises later
     doubts = (0.0, 0.0, 0.0, 2.0)
     return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), doubts=doubts, **options)

@@ -66,11 +66,6 @@ class ContactStep:
     jacobian: Float[Tensor, "n_s n_a"]
     """``d increment/d da`` of the last substep, contacts doing what they do at its end."""
 
-    @property
-    def farthest_slide(self) -> float:
-        """Of any contact [m]."""
-        return max(self.slid.values(), default=0.0)
-
 
 class _Solved(NamedTuple):
     names: tuple[str, ...]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
-from typing import NamedTuple
+from functools import cache, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -139,8 +139,7 @@ def descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: 
         gtol=1e-9,
     )
     start = np.clip(guess, low + 1e-9, high - 1e-9)
-    # small matrices: on a busy machine threads that wait for each other take up to a hundred times as long
-    with require("threadpoolctl").threadpool_limits(1):
+    with _threads().limit(limits=1):
         try:
             found = squares(start)
         except np.linalg.LinAlgError:  # LAPACK's SVD does not converge on every processor: by another way
@@ -149,6 +148,15 @@ def descend(problem: PinchProblem, request: PinchRequest, guess: Array, ranges: 
     violation, outside = np.abs(problem.equations(request, g)).max(), problem.outside(g).max(initial=-np.inf)
     facing = np.abs(g.facing).min()
     return Solution(found.x, float(violation), float(outside), float(found.cost), float(facing))
+
+
+@cache
+def _threads() -> Any:
+    """Of the libraries of linear algebra, which are searched for once.
+
+    Matrices are small: on a busy machine threads that wait for each other take up to a hundred times as long.
+    """
+    return require("threadpoolctl").ThreadpoolController()
 
 
 def pinch_hint(problem: PinchProblem) -> str:
