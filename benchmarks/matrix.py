@@ -135,7 +135,9 @@ class Question(Protocol):
             tables.append(ends_table(turns, self.by, self.split))
         drawn = ends_picture(turns, self.by, self.split) if self.picture is None else self.picture(turns)
         figure = save_figure(drawn, folder, self.name, f"{self.title}: each group of turns.")
-        return Report(self.title, f"{self.answer(turns)}.", tables, [figure])
+        before = select(trials).drop(select(trials, kind="turn").index)
+        lost = f" Of {len(before)} turns before these {int(before['lost'].sum())} lost the object."
+        return Report(self.title, f"{self.answer(turns)}.{lost if len(before) else ''}", tables, [figure])
 
     def answer(self, turns: Frame) -> str:
         """What came of each group."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from . import experts as E
 from . import local_noise as L
@@ -18,18 +18,18 @@ from . import mixture_plan as G
 from .base import FARTHEST as FARTHEST_MEAN
 from .sparse_gp import plan as P
 from .sparse_gp.engine.numba_math import exp, log
-from .sparse_gp.engine.numba_memory import A1, A2, I1, INNER, INT, TINY, F, matrix_at, vector_at
+from .sparse_gp.engine.numba_memory import A1, A2, I1, INT, TINY, F, inner, matrix_at, vector_at
 from .tails import LARGEST, MEMORY
 
 _N = len(L.SHARES)
 
 
-@njit(F(F), **INNER)
+@inner(F(F))
 def _bounded(z):
     return min(max(z, -E.FARTHEST), E.FARTHEST) if z == z else E.FARTHEST
 
 
-@njit(F(A1, A1), **INNER)
+@inner(F(A1, A1))
 def _believed(values, evidence):
     """Their mean, weighted by evidence."""
     most, total, mean = -np.inf, 0.0, 0.0
@@ -42,7 +42,7 @@ def _believed(values, evidence):
     return mean / total
 
 
-@njit(types.void(I1, INT, F, F), **INNER)
+@inner(types.void(I1, INT, F, F))
 def _follow_tails(g, o, z, since):
     """See ``ScaleMixture.observe``."""
     n = g[G.N_TAILS]
@@ -63,13 +63,13 @@ def _follow_tails(g, o, z, since):
         evidence[t] -= most
 
 
-@njit(F(I1, INT), **INNER)
+@inner(F(I1, INT))
 def share_of_noise(g, o):
     """s of LocalNoise."""
     return _believed(vector_at(g[G.NOISE_SHARES], 0, _N), vector_at(g[G.NOISE_EVIDENCE], o, _N))
 
 
-@njit(F(I1, INT, F, F), **INNER)
+@inner(F(I1, INT, F, F))
 def _target_of_noise(g, o, size, f):
     """What f learns of a log innovation, after its evidence, see ``LocalNoise.observe``."""
     n, most = _N, -np.inf
@@ -85,7 +85,7 @@ def _target_of_noise(g, o, size, f):
     return math.log(min(math.exp(size - f), L.MOST) + L.FLOOR) + L.CENTRE + f
 
 
-@njit(types.void(I1, INT, F, A1, A1), **INNER)
+@inner(types.void(I1, INT, F, A1, A1))
 def _weigh(g, o, scale, far, p):
     """Evidence and what is carried over, from innovations ``far`` in typical scales; ``p``: ``r / 10``.
 
@@ -126,7 +126,7 @@ def _weigh(g, o, scale, far, p):
         p[e] = exp(p[e] - most)
 
 
-@njit(types.void(I1, INT, INT, A1, A1), **INNER)
+@inner(types.void(I1, INT, INT, A1, A1))
 def _settle(g, o, n_learners, p, carried):
     """What queries need of the experts, from weights p that do not sum to 1 yet, see ``_settle``.
 
@@ -162,7 +162,7 @@ def _settle(g, o, n_learners, p, carried):
         offset[0] += sum_ / total
 
 
-@njit(F(I1, INT, A1), **INNER)
+@inner(F(I1, INT, A1))
 def mean_of(g, o, means):
     """The mixture's, cut at twice the largest y."""
     mean, gain = vector_at(g[G.OFFSET], o, 1)[0], vector_at(g[G.GAIN], o, means.shape[0])
@@ -171,7 +171,7 @@ def mean_of(g, o, means):
     return mean
 
 
-@njit(F(I1, INT, A1), **INNER)
+@inner(F(I1, INT, A1))
 def scatter_of(g, o, noisy):
     """Variance of y as the learners state it, by their weights."""
     n_learners, n_shares, variance = noisy.shape[0], g[G.N_SHARES], 0.0
@@ -181,7 +181,7 @@ def scatter_of(g, o, noisy):
     return variance
 
 
-@njit(types.void(I1, INT, A1, A1), **INNER)
+@inner(types.void(I1, INT, A1, A1))
 def make_finite(g, o, means, variances):
     """See ``_finite`` and ``_wide`` of the mixture."""
     most = vector_at(g[P.LARGEST], o, 1)[0]
@@ -190,7 +190,7 @@ def make_finite(g, o, means, variances):
         variances[i] = variances[i] if math.isfinite(variances[i]) else most * most
 
 
-@njit(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1, A1, A2), **INNER)
+@inner(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1, A1, A2))
 def judge(g, o, y, judged, since, means, noisy, far, p, local, said):
     """One output of one model: how far y lies from each expert's mean, and what follows; returns the nis.
 

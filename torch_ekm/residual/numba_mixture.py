@@ -22,14 +22,14 @@ from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
 from .sparse_gp.engine.numba_descent import gather_fleet as gather_fleet
 from .sparse_gp.engine.numba_descent import step_fleet as step_fleet
-from .sparse_gp.engine.numba_memory import A2, A3, COMMON, I1, I2, INNER, INT, ON, matrix_at, vector_at
+from .sparse_gp.engine.numba_memory import A2, A3, COMMON, I1, I2, INT, ON, inner, matrix_at, vector_at
 from .sparse_gp.engine.numba_rebuild import rebuild_fleet as rebuild_fleet
 from .sparse_gp.engine.numba_units import pool_columns as pool_columns
 
 embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
 
 
-@njit(types.void(I1, A3, I2, A2), **INNER)
+@inner(types.void(I1, A3, I2, A2))
 def _of_all(g, figures, events, of_all):
     """Novelty and weight of a sample by the say of each learner, and the largest event."""
     m, n_learners = g[P.OUT], figures.shape[0] - 1

@@ -11,7 +11,7 @@ from ...typing import Tensor
 from ..running_scale import ALIEN, BLOCK, RunningScale, Units
 from .part import Host, Part
 
-_AHEAD = 3  # samples by which a block ends before a rebuild, so that both do not fall on one
+_AHEAD = 1  # samples by which a block ends before a rebuild: it falls on the step there, on none of its own
 _DOUBLING = 1024  # samples up to which units are adopted after 1, 2, 4, 8, ... samples, too
 
 
@@ -97,7 +97,7 @@ class Standardize(Part):
             self._adopt(learner)
 
     def _pool(self, learner: Host) -> None:
-        """Blocks end with the 32nd sample, and three samples before each rebuild from then on."""
+        """Blocks end with the 32nd sample, and a sample before each rebuild from then on."""
         n, offset = learner.n_samples + 1, (learner.refresh_offset - _AHEAD) % BLOCK
         if n == BLOCK or (n > BLOCK and (n - offset) % BLOCK == 0):
             size = offset if offset and n == BLOCK + offset else BLOCK

@@ -16,7 +16,7 @@ from .. import plan as P
 from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, RING_SIZE, Z90_SQUARED
 from .numba_kernels import embed, kernel_row, kernel_slopes, network_back, turn_weights
 from .numba_math import exp
-from .numba_memory import A1, A2, COMMON, I1, INNER, INT, ON, F, integers_at, matrix_at, vector_at
+from .numba_memory import A1, A2, COMMON, I1, INT, ON, F, inner, integers_at, matrix_at, vector_at
 from .numba_recursion import absorb, times
 
 
@@ -34,7 +34,7 @@ def embed_fleet(p):
         embed(p, b * p[P.OWN], values, matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH]))
 
 
-@njit(F(I1, INT, A1, A1, A1, A1, A1, A1), **INNER)
+@inner(F(I1, INT, A1, A1, A1, A1, A1, A1))
 def look(p, b, x, values, q, k, psi, phi):
     """k between x and the basis of model b, and what its slopes need; returns k(x, x).
 
@@ -50,7 +50,7 @@ def look(p, b, x, values, q, k, psi, phi):
     return kernel_row(p, own, q, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi)
 
 
-@njit(F(I1, INT, F, A1, A1, A1), **INNER)
+@inner(F(I1, INT, F, A1, A1, A1))
 def mean_and_variance(p, b, prior, k, Ck, mean):
     """The mean in the units of y, not yet cut; returns the latent variance in the learner's. Makes Ck."""
     M, m = p[P.SLOTS], p[P.OUT]
@@ -71,7 +71,7 @@ def mean_and_variance(p, b, prior, k, Ck, mean):
     return max(v, 0.0)
 
 
-@njit(types.void(I1, INT, A1, A1), **INNER)
+@inner(types.void(I1, INT, A1, A1))
 def cut(p, b, mean, inside):
     """The mean, cut at twice the largest y; ``inside`` is 0 where it was, else 1."""
     largest = vector_at(p[P.LARGEST], b, p[P.OUT])
@@ -81,7 +81,7 @@ def cut(p, b, mean, inside):
         mean[o] = min(max(mean[o], -most), most)
 
 
-@njit(F(I1, INT), **INNER)
+@inner(F(I1, INT))
 def shared_noise(p, b):
     """See ``Host.shared_noise``."""
     m, total = p[P.OUT], 0.0
@@ -91,7 +91,7 @@ def shared_noise(p, b):
     return math.exp(total / m)
 
 
-@njit(types.void(I1, INT, A1), **INNER)
+@inner(types.void(I1, INT, A1))
 def noise_of(p, b, noise):
     """Observation noise of each output in squared units of y, as calibrated."""
     m = p[P.OUT]
@@ -136,10 +136,8 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
             for o in range(m, rows):
                 left[i, o] = 2.0 * Ck[i]
         kernel_slopes(p, own, q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, left, slopes)
-        log_variance, log_action = (
-            vector_at(p[P.LOG_VARIANCE], own, 1)[0],
-            vector_at(p[P.LOG_ACTION], own, n_a),
-        )
+        log_variance = vector_at(p[P.LOG_VARIANCE], own, 1)[0]
+        log_action = vector_at(p[P.LOG_ACTION], own, n_a)
         for o in range(m, rows):  # k(x, x) of an action-linear kernel
             for j in range(n_a):
                 slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
@@ -162,7 +160,7 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
                     matrix_at(dv, b, m, d)[to, j] = slopes[o, j] * scale_y[to] * scale_y[to] * by_x
 
 
-@njit(types.UniTuple(A1, 5)(I1, INT), **INNER)
+@inner(types.UniTuple(A1, 5)(I1, INT))
 def room_of(p, b):
     """What an update of model b finds: z with all layers, and as the kernel sees it, k, Ck, k(x, x)."""
     n, W, M = p[P.VALUES], p[P.WIDTH], p[P.SLOTS]
@@ -174,7 +172,7 @@ def room_of(p, b):
     )  # fmt: skip
 
 
-@njit(INT(I1, INT, A1, A1, A1), **INNER)
+@inner(INT(I1, INT, A1, A1, A1))
 def learn(p, b, y, figures, error):
     """Learn the sample whose k, k(x, x) and Ck are in the room; returns the event."""
     d, m, M = p[P.IN], p[P.OUT], p[P.SLOTS]
@@ -191,7 +189,7 @@ def learn(p, b, y, figures, error):
     return absorb(p, b, prior[0], shared_noise(p, b), k, Ck, t, figures, error)
 
 
-@njit(types.void(I1, ON, INT), **INNER)
+@inner(types.void(I1, ON, INT))
 def grow_largest(p, on, y):
     """The largest y so far takes these in."""
     m = p[P.OUT]
@@ -202,7 +200,7 @@ def grow_largest(p, on, y):
                 largest[o] = max(largest[o], abs(y_[o]))
 
 
-@njit(types.boolean(I1, INT, ON, INT, A2, A2), **INNER)
+@inner(types.boolean(I1, INT, ON, INT, A2, A2))
 def changed(p, n, on, y, figures, errors):
     """What DetectChanges notes of the sample after n per model; whether a model faces another system."""
     m, alarm = p[P.OUT], False
@@ -221,7 +219,7 @@ def changed(p, n, on, y, figures, errors):
     return alarm
 
 
-@njit(types.boolean(I1, INT, ON, INT, INT, A2, A2), **INNER)
+@inner(types.boolean(I1, INT, ON, INT, INT, A2, A2))
 def note(p, n, on, x, y, figures, errors):
     """All notes of the sample after n per model; whether a model faces another system."""
     d, m = p[P.IN], p[P.OUT]
@@ -245,7 +243,7 @@ def note(p, n, on, x, y, figures, errors):
     return p[P.CHANGED] != 0 and changed(p, n, on, y, figures, errors)
 
 
-@njit(types.boolean(I1, INT, INT), **INNER)
+@inner(types.boolean(I1, INT, INT))
 def are_finite(p, x, y):
     """Whether the squares of a sample per model are."""
     n, m, total = p[P.MODELS] * p[P.IN], p[P.MODELS] * p[P.OUT], 0.0

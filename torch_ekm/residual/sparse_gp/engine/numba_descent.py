@@ -32,10 +32,10 @@ from .numba_memory import (
     COMMON,
     EPS,
     I1,
-    INNER,
     INT,
     TINY,
     F,
+    inner,
     integers_at,
     matrix_at,
     stack_at,
@@ -47,7 +47,7 @@ from .numba_memory import (
 SUMS = types.Tuple((A2, A2, A2, A2, A1, A1))
 
 
-@njit(SUMS(I1, INT), **INNER)
+@inner(SUMS(I1, INT))
 def _sums(p, b):
     """Memory of them."""
     M, W, m, n = p[P.SLOTS], p[P.WIDTH], p[P.OUT], integers_at(p[P.LEARNING], 0, 4)[3]
@@ -60,7 +60,7 @@ def _sums(p, b):
     )  # fmt: skip
 
 
-@njit(INT(I1, INT, INT, INT, INT, A2, A2, A2), **INNER)
+@inner(INT(I1, INT, INT, INT, INT, A2, A2, A2))
 def _draw(p, b, n, n_rebuilt, n_taken, values, y, about):
     """Queries in units, see ``LearnHyperparameters.queries``; returns their number.
 
@@ -75,11 +75,8 @@ def _draw(p, b, n, n_rebuilt, n_taken, values, y, about):
     first = n_taken % stride
     x_of, y_of = matrix_at(p[P.RECENT_X], b, size, d), matrix_at(p[P.RECENT_Y], b, size, m)
     weight_of = vector_at(p[P.RECENT], b, size)
-    shift, scale, reach = (
-        vector_at(p[P.SHIFT], b, d),
-        vector_at(p[P.SCALE], b, d),
-        vector_at(p[P.REACH], 0, d),
-    )
+    shift, scale = vector_at(p[P.SHIFT], b, d), vector_at(p[P.SCALE], b, d)
+    reach = vector_at(p[P.REACH], 0, d)
     shift_y, scale_y = vector_at(p[P.SHIFT_Y], b, m), vector_at(p[P.SCALE_Y], b, m)
     q = 0
     for i in range(k + new):
@@ -98,7 +95,7 @@ def _draw(p, b, n, n_rebuilt, n_taken, values, y, about):
     return q
 
 
-@njit(types.void(I1, INT, A2, A2, A1, A2, A2, A2, A1, A2), **INNER)
+@inner(types.void(I1, INT, A2, A2, A1, A2, A2, A2, A1, A2))
 def _density(p, b, mean, y, diagonal, kE_u, about, by_mean, by_log_noise, by):
     """Derivatives of the loss times all weights, see ``PrequentialLoss._density``.
 
@@ -137,7 +134,7 @@ def _density(p, b, mean, y, diagonal, kE_u, about, by_mean, by_log_noise, by):
         by[q, 1] = by_left * (c - 1.0) + by_exact - by_most * most
 
 
-@njit(types.void(I1, INT, A2, A1, A2, A1, A2, A2, A2, A2, A2, A2, types.boolean), **INNER)
+@inner(types.void(I1, INT, A2, A1, A2, A1, A2, A2, A2, A2, A2, A2, types.boolean))
 def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, of_basis):
     """What follows of derivatives by k for the kernel's parameters.
 
@@ -150,10 +147,8 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
     """
     N, M, W, n_a, own = k.shape[0], p[P.SLOTS], p[P.WIDTH], p[P.ACTIONS], b * p[P.OWN]
     d, n_s, gradient = p[P.IN], p[P.IN] - n_a, _sums(p, b)[4]
-    log_action, variance = (
-        vector_at(p[P.LOG_ACTION], own, n_a),
-        math.exp(vector_at(p[P.LOG_VARIANCE], own, 1)[0]),
-    )
+    log_action = vector_at(p[P.LOG_ACTION], own, n_a)
+    variance = math.exp(vector_at(p[P.LOG_VARIANCE], own, 1)[0])
     for i in range(N):
         gradient[d] += by_diagonal[i] * diagonal[i] + dot(by[i], k[i], M)
     for j in range(n_a):
@@ -217,12 +212,9 @@ def gather_fleet(p, n, n_rebuilt, n_taken, begin, end):
     x, y_, about_ = np.empty((most, d)), np.empty((most, m)), np.empty((most, 2))
     for b in range(p[P.MODELS]):
         by_K, less, by_alpha, back, gradient, rest = _sums(p, b)
-        for part in (by_K, less, by_alpha, back):
-            for i in range(M if begin == 0.0 else 0):
-                part[i] = 0.0
-        for part in (gradient, rest):
-            for i in range(part.shape[0] if begin == 0.0 else 0):
-                part[i] = 0.0
+        if begin == 0.0:
+            by_K[:, :] = less[:, :] = by_alpha[:, :] = back[:, :] = 0.0
+            gradient[:] = rest[:] = 0.0
         found = _draw(p, b, n, n_rebuilt, n_taken, x, y_, about_)
         first, last, own = int(begin * found), int(end * found), b * p[P.OWN]
         y, about, N = y_[first:last], about_[first:last], last - first
@@ -265,7 +257,7 @@ def gather_fleet(p, n, n_rebuilt, n_taken, begin, end):
         _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, False)
 
 
-@njit(types.void(I1, INT), **INNER)
+@inner(types.void(I1, INT))
 def _step(p, b):
     """Of Adam, of model b."""
     gradient, rest = _sums(p, b)[4:]
@@ -278,11 +270,8 @@ def _step(p, b):
     for i in range(integers_at(p[P.LEARNING], 0, 3)[2]):
         row = integers_at(p[P.PARAMETERS], i, 6)
         size, by, kind = row[3], gradient[row[4] :], row[5]
-        theta, first, second = (
-            vector_at(row[0], b, size),
-            vector_at(row[1], b, size),
-            vector_at(row[2], b, size),
-        )
+        theta, first = vector_at(row[0], b, size), vector_at(row[1], b, size)
+        second = vector_at(row[2], b, size)
         step = (rate if kind > 0 else NETWORK_RATE) * correction
         for j in range(size):
             g = by[j] / rest[1]
@@ -306,11 +295,8 @@ def step_fleet(p):
         by_K, less, T, back, gradient, rest = _sums(p, b)
         if rest[2] == 0.0:
             continue
-        points, alpha, own = (
-            matrix_at(p[P.BASIS], b, M, d),
-            matrix_at(p[P.VECTORS], 2 * b, M, m),
-            b * p[P.OWN],
-        )
+        points, own = matrix_at(p[P.BASIS], b, M, d), b * p[P.OWN]
+        alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
         basis = matrix_at(p[P.EMBEDDED], b, M, W)
         for i in range(M):
             for j in range(d):

@@ -14,11 +14,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from .. import plan as P
 from .numba_math import add_products, dot, exp, transposed
-from .numba_memory import A1, A2, I1, INNER, INT, F, integers_at, matrix_at
+from .numba_memory import A1, A2, I1, INT, F, inner, integers_at, matrix_at
 from .numba_memory import vector_at as at
 
 #: what a kernel's ``kind`` means
@@ -26,7 +26,7 @@ SQUARED_EXPONENTIAL, MATERN32 = 0, 1
 _FAR = 1e10  # squared scaled distance beyond which a kernel is 0
 
 
-@njit(types.void(I1, INT, A2), **INNER)
+@inner(types.void(I1, INT, A2))
 def network(p, own, values):
     """net(z) at the end of each row of ``values``, which begins with z and holds each layer."""
     begin, N = 0, values.shape[0]
@@ -48,7 +48,7 @@ def network(p, own, values):
                 to[j] = row[j]
 
 
-@njit(types.void(I1, INT, A2, A2, A2, A1), **INNER)
+@inner(types.void(I1, INT, A2, A2, A2, A1))
 def network_back(p, own, values, by, to, gradient):
     """From derivatives by features those by z, which ``to`` gains, and by weights and biases.
 
@@ -86,7 +86,7 @@ def network_back(p, own, values, by, to, gradient):
             to[i, j] += by[i, j]
 
 
-@njit(types.void(I1, INT, A2, A2), **INNER)
+@inner(types.void(I1, INT, A2, A2))
 def embed(p, own, values, q):
     """``q``: points as the kernel sees them, in its lengthscales and with a network's features behind.
 
@@ -104,7 +104,7 @@ def embed(p, own, values, q):
             q[i, j] = values[i, n - q.shape[1] + j]
 
 
-@njit(types.void(I1, INT), **INNER)
+@inner(types.void(I1, INT))
 def turn_weights(p, own):
     """The network's weights the other way round, where products of rows find them."""
     for layer in range(p[P.LAYERS]):
@@ -115,7 +115,7 @@ def turn_weights(p, own):
                 to[j, i] = W[i, j]
 
 
-@njit(types.void(INT, F, A1, A1, A1), **INNER)
+@inner(types.void(INT, F, A1, A1, A1))
 def _correlations(kind, variance, active, k, psi):
     """From squared scaled distances in ``k``: k and ``v psi`` at points in use, 0 elsewhere, see
     StationaryKernel."""
@@ -140,7 +140,7 @@ def _correlations(kind, variance, active, k, psi):
         psi[i] = psi[i] if active[i] != 0.0 else 0.0
 
 
-@njit(F(I1, INT, A1, A2, A1, A1, A1, A1), **INNER)
+@inner(F(I1, INT, A1, A2, A1, A1, A1, A1))
 def _of_distances(p, own, q, basis, active, k, psi, phi):
     """See :func:`kernel_row`; k begins as squared distances."""
     n, n_a, n_s = basis.shape[0], p[P.ACTIONS], q.shape[0] - p[P.ACTIONS]
@@ -163,7 +163,7 @@ def _of_distances(p, own, q, basis, active, k, psi, phi):
     return variance * norm
 
 
-@njit(F(I1, INT, A1, A2, A1, A1, A1, A1), **INNER)
+@inner(F(I1, INT, A1, A2, A1, A1, A1, A1))
 def kernel_row(p, own, q, basis, active, k, psi, phi):
     """k between q and the basis, both as the kernel sees them; returns k(q, q).
 
@@ -180,7 +180,7 @@ def kernel_row(p, own, q, basis, active, k, psi, phi):
     return _of_distances(p, own, q, basis, active, k, psi, phi)
 
 
-@njit(types.void(I1, INT, A2, A2, A1, A2, A2, A2, A1), **INNER)
+@inner(types.void(I1, INT, A2, A2, A1, A2, A2, A2, A1))
 def kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal):
     """See :func:`kernel_row`, of many points q; their k(q, q) into ``diagonal``."""
     N, M, n_s = q.shape[0], basis.shape[0], q.shape[1] - p[P.ACTIONS]
@@ -199,7 +199,7 @@ def kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal):
         diagonal[i] = _of_distances(p, own, q[i], basis, active, k[i], psi[i], phi[i])
 
 
-@njit(types.void(I1, INT, A1, A2, A1, A1, A2, A2), **INNER)
+@inner(types.void(I1, INT, A1, A2, A1, A1, A2, A2))
 def kernel_slopes(p, own, q, basis, psi, phi, left, out):
     """``out = left' dk/dq``, ``left (slots, rows)``."""
     n_a, log_action = p[P.ACTIONS], at(p[P.LOG_ACTION], own, p[P.ACTIONS])

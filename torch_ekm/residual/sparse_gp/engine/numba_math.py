@@ -6,11 +6,11 @@ They vectorise where they stand in a loop, as those of the C library do not.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
-from .numba_memory import A1, A2, INNER, INT, F, made
+from .numba_memory import A1, A2, INT, F, inner, made
 
-_EXACT = {**INNER, "fastmath": {"contract"}}  # sums in the order in which they stand
+_EXACT = {"contract"}  # sums in the order in which they stand
 _TO_INTEGER = 6755399441055744.0  # 1.5 * 2^52: its last bits are those of what was added
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10
 _MANTISSA, _ONE = 0xFFFFFFFFFFFFF, 0x3FF0000000000000  # bits of a double: the last 52, and those of 1.0
@@ -36,7 +36,7 @@ def _bits(context, value):
     return types.int64(types.float64), generate
 
 
-@njit(F(F), **_EXACT)
+@inner(F(F), fastmath=_EXACT)
 def exp(x):
     """e^x to rounding; what would leave the range of doubles stays at its end."""
     x = min(max(x, -708.0), 709.0)
@@ -59,7 +59,7 @@ def exp(x):
     return p * _as_float((_bits(n) << 52) + _ONE)
 
 
-@njit(F(F), **_EXACT)
+@inner(F(F), fastmath=_EXACT)
 def log(y):
     """ln y of a normal y > 0: ``y = 2^e m``, ``ln m = 2 artanh((m - 1)/(m + 1))``."""
     bits = _bits(y)
@@ -82,7 +82,7 @@ def log(y):
     return e * 0.6931471805599453 + 2.0 * s * (p * q + 1.0)
 
 
-@njit(F(A1, A1, INT), **INNER)
+@inner(F(A1, A1, INT))
 def dot(a, b, n):
     """Of the first n entries."""
     total = 0.0
@@ -91,7 +91,7 @@ def dot(a, b, n):
     return total
 
 
-@njit(types.void(A2, A2, F, A2, types.boolean, types.boolean), **INNER)
+@inner(types.void(A2, A2, F, A2, types.boolean, types.boolean))
 def add_products(A, B, a, out, lower, upper):
     """``out += a A B'``, four rows by two at a time: each number that is read serves two to four sums.
 
@@ -104,12 +104,8 @@ def add_products(A, B, a, out, lower, upper):
     n, m, K, sums = A.shape[0], B.shape[0], A.shape[1], np.empty((2, 4))
     for i in range(0, n, 4):
         rows, end, k0 = min(4, n - i), min(m, i + 4) if lower else m, i if upper else 0
-        a0, a1, a2, a3 = (
-            A[i, k0:],
-            A[min(i + 1, n - 1), k0:],
-            A[min(i + 2, n - 1), k0:],
-            A[min(i + 3, n - 1), k0:],
-        )
+        a0, a1 = A[i, k0:], A[min(i + 1, n - 1), k0:]
+        a2, a3 = A[min(i + 2, n - 1), k0:], A[min(i + 3, n - 1), k0:]
         for j in range(0, end, 2):
             b, c = B[j, k0:], B[min(j + 1, m - 1), k0:]
             s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
@@ -129,7 +125,7 @@ def add_products(A, B, a, out, lower, upper):
                     out[i + r, j + s] += a * sums[s, r]
 
 
-@njit(A2(A2), **INNER)
+@inner(A2(A2))
 def transposed(A):
     """A', in memory of its own."""
     out = np.empty((A.shape[1], A.shape[0]))

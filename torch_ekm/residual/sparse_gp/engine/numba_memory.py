@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,33 @@ COMMON = {
     "cache": True, "nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "arcp", "nsz"},
 }  # fmt: skip
-INNER = {**COMMON, "no_cpython_wrapper": True}  # called from loops alone
 A1, A2, A3 = (types.Array(types.float64, n, "C") for n in (1, 2, 3))
-I1, I2, F, INT = (
-    types.Array(types.int64, 1, "C"),
-    types.Array(types.int64, 2, "C"),
-    types.float64,
-    types.int64,
-)
-ON = types.boolean[::1]
+I1, I2 = types.Array(types.int64, 1, "C"), types.Array(types.int64, 2, "C")
+F, INT, ON = types.float64, types.int64, types.boolean[::1]
+
+
+def inner(signature: Any, **options: Any) -> Callable[[Callable], Any]:
+    """A loop that loops alone call: it is compiled, or found again, when a caller is compiled.
+
+    A caller that is found again has its code: to load it, too, takes a quarter of all loading.
+    """
+    options = {**COMMON, "no_cpython_wrapper": True, **options}
+
+    def decorate(function: Callable) -> Any:
+        loop: Any = njit(**options)(function)
+        template = loop.get_call_template
+
+        def called(*types: Any) -> Any:
+            if not loop.signatures:
+                loop.compile(signature)
+                loop.disable_compile()
+            return template(*types)
+
+        loop.get_call_template = called
+        return loop
+
+    return decorate
+
 
 made: Any = intrinsic  # which passes the context itself
 

@@ -15,10 +15,10 @@ from .. import plan as P
 from .numba_core import shared_noise
 from .numba_kernels import kernel_rows
 from .numba_math import add_products, dot, transposed
-from .numba_memory import A1, A2, COMMON, EPS, I1, INNER, INT, F, matrix_at, stack_at, vector_at
+from .numba_memory import A1, A2, COMMON, EPS, I1, INT, F, inner, matrix_at, stack_at, vector_at
 
 
-@njit(types.void(A2), **INNER)
+@inner(types.void(A2))
 def _mirror(A):
     """The lower half is the upper one, too."""
     for i in range(A.shape[0]):
@@ -26,7 +26,7 @@ def _mirror(A):
             A[j, i] = A[i, j]
 
 
-@njit(types.void(A2), **INNER)
+@inner(types.void(A2))
 def _factorise(A):
     """A's lower half becomes L, ``A = LL'``, the upper one 0; what rounding leaves no root of stays tiny."""
     n = A.shape[0]
@@ -52,7 +52,7 @@ def _factorise(A):
                 row[j] = 0.0
 
 
-@njit(types.void(A2, A2, types.boolean), **INNER)
+@inner(types.void(A2, A2, types.boolean))
 def _solve(L, B, lower):
     """B becomes ``L^-1 B``; ``lower``: B is a lower triangle."""
     m = B.shape[1]
@@ -72,7 +72,7 @@ def _solve(L, B, lower):
             row[j] *= by
 
 
-@njit(A2(I1, INT, A2, A1), **INNER)
+@inner(A2(I1, INT, A2, A1))
 def _gram(p, b, embedded, active):
     """K between the points in use, embedded, with the jitter; 1 on the diagonal of free slots."""
     M, jitter = active.shape[0], 1.0 + vector_at(p[P.FIGURES], 0, 3)[1]
@@ -85,7 +85,7 @@ def _gram(p, b, embedded, active):
     return K
 
 
-@njit(types.void(A2, A2, A2, A2, F, F), **INNER)
+@inner(types.void(A2, A2, A2, A2, F, F))
 def _wander(Lt, LW, precision, information, kept, s2):
     """See :class:`~torch_ekm.residual.ProcessNoise`; ``LW``: L'W, is overwritten."""
     M, m, lost = Lt.shape[0], information.shape[1], 1.0 - kept

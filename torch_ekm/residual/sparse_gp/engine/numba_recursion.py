@@ -9,15 +9,15 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from .. import plan as P
 from ..monitor import DISTRUSTED, DISTRUSTED_MOST, RATE
-from .numba_memory import A1, A2, A3, EPS, I1, INNER, INT, TINY, F, integers_at, stack_at, vector_at
+from .numba_memory import A1, A2, A3, EPS, I1, INT, TINY, F, inner, integers_at, stack_at, vector_at
 from .recursion import LEAST_NOVELTY, TIE, TIE_KL
 
 
-@njit(types.void(A2, A1, A1), **INNER)
+@inner(types.void(A2, A1, A1))
 def times(A, vector, out):
     """``out = A vector``."""
     n = vector.shape[0]
@@ -28,7 +28,7 @@ def times(A, vector, out):
         out[i] = total
 
 
-@njit(types.void(A2, F, A1), **INNER)
+@inner(types.void(A2, F, A1))
 def _add_square(A, a, u):
     """``A += a u u'``."""
     n = u.shape[0]
@@ -38,13 +38,13 @@ def _add_square(A, a, u):
             row[j] += b * u[j]
 
 
-@njit(F(F, F), **INNER)
+@inner(F(F, F))
 def _remaining(c, q):
     """``c + q``, which rounding must not turn negative."""
     return max(c + q, 100.0 * EPS * q)
 
 
-@njit(INT(F, A1, A1, A1, A3, A3), **INNER)
+@inner(INT(F, A1, A1, A1, A3, A3))
 def _least_loss(s2, active, c_diag, q_diag, moments, vectors):
     """The point that loses least when it is pruned, see ``pruning_loss``."""
     best, m, losses = np.inf, vectors.shape[2], np.empty(active.shape[0])
@@ -67,7 +67,7 @@ def _least_loss(s2, active, c_diag, q_diag, moments, vectors):
     return 0
 
 
-@njit(types.void(A3, A3, A1, A1, A1, A1, F, F, INT, F), **INNER)
+@inner(types.void(A3, A3, A1, A1, A1, A1, F, F, INT, F))
 def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
     """Add the new point to C and Q and prune point i of all three, in one pass.
 
@@ -109,7 +109,7 @@ def _add_and_prune(moments, vectors, s, p, work_c, work_q, gain, grow, i, w):
         vectors[r, i, :] = 0.0
 
 
-@njit(INT(I1, INT, F, F, A1, A1, A1, A1, A1), **INNER)
+@inner(INT(I1, INT, F, F, A1, A1, A1, A1, A1))
 def absorb(p, b, prior, s2, k, Ck, t, figures, error):
     """One sample of model b, see ``recursion.absorb``; returns the event. Its input is in the free slot.
 

@@ -8,10 +8,10 @@ import numpy as np
 from numba import njit, types
 
 from ...running_scale import ALIEN, BLOCK, BURST_CLIP, CLIP, COMPANY, DOUBT, REST, SPIKES, TRIMMED
-from .numba_memory import A1, COMMON, INNER, INT, TINY, F, matrix_at, vector_at
+from .numba_memory import A1, COMMON, INT, TINY, F, inner, matrix_at, vector_at
 
 
-@njit(F(A1, F), **INNER)
+@inner(F(A1, F))
 def _trimmed(squares, part):
     """Root of the mean of n squares in order without the last n/part."""
     kept, total = max(squares.shape[0] - math.ceil(squares.shape[0] / part), 0), 0.0
