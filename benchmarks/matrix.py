@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 Frame = Any  # pandas has no types
 EARLY = 5  # motions with an object
 _INTERVAL = 1.645  # standard deviations: 90 %
-_PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#7f7f7f", "#F0E442")
+_PALETTE = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9", "#F0E442", "#332288")
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,13 @@ class Question(Protocol):
         if turns[self.split].nunique() > 1 and self.split != self.by:
             tables.append(ends_table(turns, self.by, self.split))
         drawn = ends_picture(turns, self.by, self.split) if self.picture is None else self.picture(turns)
-        figure = save_figure(drawn, folder, self.name, f"{self.title}: each group of turns.")
+        of = "Each group of turns." if self.picture is None else f"{self.title}."
+        figure = save_figure(drawn, folder, self.name, of)
+        # the tables have the others
+        first = turns if self.told else turns[turns[self.by].isin(turns[self.by].head(1))]
         before = select(trials).drop(select(trials, kind="turn").index)
         lost = f" Of {len(before)} turns before these {int(before['lost'].sum())} lost the object."
-        return Report(self.title, f"{self.answer(turns)}.{lost if len(before) else ''}", tables, [figure])
+        return Report(self.title, f"{self.answer(first)}.{lost if len(before) else ''}", tables, [figure])
 
     def answer(self, turns: Frame) -> str:
         """What came of each group."""
@@ -231,7 +234,8 @@ def ends_table(turns: Frame, by: str, split: str) -> Table:
     """Lost, reached, motions: a row for each entry of ``split``, a column for each of ``by``."""
 
     def cell(mine: Frame) -> str:
-        return f"{int(mine['lost'].sum())}, {len(_reached(mine))}, {_mean(_reached(mine)['motions']):.1f}"
+        motions = Column("", ".1f").text(_mean(_reached(mine)["motions"]))
+        return f"{int(mine['lost'].sum())}, {len(_reached(mine))}, {motions}"
 
     return pivot(turns, by, split, cell, "lost, reached, and motions of those that reached the target")
 
@@ -240,8 +244,10 @@ def ends_picture(turns: Frame, by: str, split: str) -> Figure:
     """Turns lost and not reached, and motions, for each group."""
     names, groups = list(dict.fromkeys(turns[by])), list(dict.fromkeys(turns[split]))
     figure, (ends, motions) = new_figure(8.5, 0.28 * len(groups) + 1.4, 2, 1, sharey=True)
+    known = [COLOURS[name] for name in names if name in COLOURS]
+    free = itertools.cycle(colour for colour in _PALETTE if colour not in known)
     for k, name in enumerate(names):
-        colour = COLOURS.get(name, _PALETTE[k % len(_PALETTE)])
+        colour = COLOURS.get(name) or next(free)
         for i, group in enumerate(groups):
             mine = turns[(turns[by] == name) & (turns[split] == group)]
             at, n = i + 0.7 * ((k + 0.5) / len(names) - 0.5), max(len(mine), 1)
@@ -256,6 +262,21 @@ def ends_picture(turns: Frame, by: str, split: str) -> Figure:
     motions.set(xlabel="motions of a turn that reached the target", xlim=(0, None))
     figure.legend(loc="outside upper center", ncols=4, frameon=False, fontsize=8)
     return figure
+
+
+def points(x: str, y: str, xlabel: str, ylabel: str) -> Callable[[Frame], Figure]:
+    """Draws one point a turn: an expression of columns against another, in the colour of its case."""
+
+    def draw(turns: Frame) -> Figure:
+        figure, (axes,) = new_figure(6.0, 3.2)
+        at = turns.assign(_x=turns.eval(x), _y=turns.eval(y)).dropna(subset=["_x", "_y"])
+        for colour, (name, mine) in zip(_PALETTE, at.groupby("case", sort=False), strict=False):
+            axes.plot(mine["_x"], mine["_y"], "o", ms=3, color=colour, label=name)
+        axes.set(xlabel=xlabel, ylabel=ylabel)
+        axes.legend(frameon=False, fontsize=8)
+        return figure
+
+    return draw
 
 
 def learning_picture(turns: Frame) -> Figure:

@@ -17,7 +17,7 @@ from contenders import (
     WHOLE_TURNS,
     Contender,
 )
-from matrix import Frame, Question, bands_table, learning_picture, table
+from matrix import Frame, Question, bands_table, learning_picture, points, table
 from sessions import TARGETS, directions, foresight, there_and_back, turns
 from slides import errors_picture, errors_table, slides, told
 
@@ -118,6 +118,7 @@ _ASKED = (
         options={"learns_by": (9.0, -9.0, 15.0), "angle": 15.0, "times": 20}, by="case", split="object",
         columns=(*_ENDS[:4], "along the grip, last [mm]", "contacts slid, last [mm]", "other ends"),
         short={"learns_by": (), "angle": 6.0, "times": 1},
+        picture=points("trial + 1", "shift", "turn, every other one back", "place along the grip [mm]"),
     ),
     Question(
         "directions", "Focused poses of one to six directions", directions, {"E-KM": Contender()},
@@ -137,6 +138,7 @@ _ASKED = (
             "estimate off by [deg]", "stated sd [deg]",
         ),
         split="object", short={"learns_by": (), "far": 6.0, "blind": 5.0},
+        picture=points("largest", "reach - largest", "farthest turn [deg]", "predicted end less that [deg]"),
     ),
     Question(
         "slides", "Contacts that slide, open and close", slides, {"KM": Contender("KM")},
