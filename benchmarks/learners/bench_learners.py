@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import functools
 import importlib.util
 import itertools
 import math
@@ -25,19 +24,7 @@ import numpy as np
 import torch
 
 from torch_ekm.experiments.reporting.report import Column, Report, Table
-from torch_ekm.residual import (
-    CalibrateNoise,
-    DeepKernel,
-    DeepKernelSOGP,
-    DetectChanges,
-    ForgettingFactor,
-    LearnHyperparameters,
-    RobustWeight,
-    SparseOnlineGP,
-    SquaredExponential,
-    Standardize,
-    default_learner,
-)
+from torch_ekm.residual import SparseOnlineGP, SquaredExponential, default_learner
 
 D = 20
 SOURCE = Path(__file__).with_name("sogp_learners_reference.c")
@@ -317,39 +304,6 @@ def of_fleets() -> Table:
     return table("Fleets of 256, per model", "what | compiled [us] | torch [us]", rows)
 
 
-def of_parts() -> Table:
-    """What a learner learns besides the residual."""
-    rows = []
-    for learned, parts in (
-        ("units", [Standardize()]),
-        ("robust, forgets", [RobustWeight(3.0), ForgettingFactor(0.99)]),
-        ("calibrated, detects changes", [CalibrateNoise(), DetectChanges()]),
-        ("learns its kernel", [LearnHyperparameters()]),
-    ):
-        calls = {name: all_of(filled(100, 6, engine=name, parts=parts), 6, (), 64) for name in ENGINES}
-        for _ in range(17):  # units stand still after a thousand samples
-            [call() for call in calls.values()]
-        found = alternately(calls, rounds=3)
-        rows.append((learned, *(us / 64 for us in found.values())))
-    return table("Parts of a learner: update, mean", "what | compiled [us] | torch [us]", rows)
-
-
-def of_whole_learners() -> Table:
-    """Learners as they are made from two sizes."""
-    rows = []
-    for name, make in (("SparseOnlineGP", SparseOnlineGP), ("default_learner", default_learner)):
-        learner, times = make(D, 6), []
-        for x, y in zip(*stream(1500, 6, seed=1), strict=True):
-            times.append(1e6 * timed(functools.partial(learner.update, x, y)))
-        rows.append((name, float(np.median(times[500:])), max(times[500:])))
-    deep = SparseOnlineGP(D, 6, kernel=DeepKernel(SquaredExponential(D))), DeepKernelSOGP(D, 6)
-    for gp in deep:
-        gp.update(*stream(2110, 6, seed=1))  # a memory is full then
-    cost = [microseconds(functools.partial(gp.update, *stream(64, 6)), 2.0) / 64 for gp in deep]
-    rows.append(("adaptation of the deep kernel", cost[1] - cost[0], math.nan))
-    return table("Whole learners: update", "what | median [us] | slowest of 1000 [us]", rows)
-
-
 def of_peers() -> Table:
     """Other libraries, ours in turns with each."""
     rows = []
@@ -365,7 +319,7 @@ def of_peers() -> Table:
 def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
-    for measure in (against_c, of_fleets, of_parts, of_whole_learners, of_peers):
+    for measure in (against_c, of_fleets, of_peers):
         print(Report("", "", [measure()]).markdown(level=2), flush=True)
 
 
