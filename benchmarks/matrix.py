@@ -79,7 +79,8 @@ class Question(Protocol):
     """Options that make a session short."""
 
     def __str__(self) -> str:
-        return f"Hands: {', '.join(hands(self.hands))}"
+        names = [*hands(self.hands)]
+        return f"Hands: {', '.join(names)}" if len(names) < 8 else f"{len(names)} hands"
 
     def quick(self) -> Self:
         """One hand and object, two contenders, true poses."""
