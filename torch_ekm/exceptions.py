@@ -122,7 +122,8 @@ class JointMismatchError(DescriptionError):
         if self.missing:
             parts.append(f"missing joints: {', '.join(self.missing)}")
         if self.unexpected:
-            parts.append(f"joints that the URDF does not have: {', '.join(self.unexpected)}")
+            names = ", ".join(self.unexpected)
+            parts.append(f"joints that do not turn, or that the URDF does not have: {names}")
         super().__init__(source, f"{'; '.join(parts)}; the URDF's joints are: {', '.join(self.valid)}")
 
 

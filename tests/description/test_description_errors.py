@@ -41,6 +41,8 @@ URDF_FAULTS = {
     "size": ('<cylinder radius="0.006"', '<cylinder radius="0"', "size of a cylinder must be positive"),
     "unknown parent": ('<parent link="hand"/>', '<parent link="wrist"/>', "unknown link 'wrist'; .*: hand"),
     "loop": ('<parent link="hand"/>', '<parent link="left_tip"/>', "one tree"),
+    "macro": ('<link name="left_tip"/>', '<x:f xmlns:x="http://ros.org/xacro"/>', "macros; run first: xacro"),
+    "macro without a name": ('<link name="left_tip"/>', "<xacro:f/>", "unbound.*; .* run first: xacro"),
     "twice": ('<link name="left_tip"/>', '<link name="hand"/>', "repeated: hand"),
 }
 EVERYWHERE = ("not a robot", "size", "no shape")  # replaced at each place, not only at the first
@@ -73,8 +75,9 @@ TRANSMISSION_FAULTS = {
     "rank": (
         "moment_arms = { left_0 = 1.0, left_1 = 0.8 }",
         "moment_arms = { right_0 = 2.0, right_1 = 1.6 }",
-        "independent",
+        "independent: .* nothing of their own: left, right",
     ),
+    "motor twice": ('name = "right"\nrange', 'name = "left"\nrange', "each actuator must be unique.*: left"),
     "pad link": ('link = "left_1"', 'link = "left_9"', "unknown link 'left_9'; the URDF's links are: hand"),
     "pad radius": ("radius = 0.006", "radius = 0.0", "'radius' must be positive"),
     "pad twice": ('name = "right"\nlink', 'name = "left"\nlink', "each pad must be unique, repeated: left"),

@@ -312,3 +312,92 @@ def test_what_check_prints_of_a_pad_lies_there_in_the_mjcf(tmp_path: Path) -> No
     shapes = load_hand(path).urdf.link(link).collisions
     found = [shape for shape in shapes if shape.size == (0.007, 0.01)]
     np.testing.assert_allclose(found[0].transform[:3, 3], [0.001, 0.002, 0.015], atol=1e-9)
+
+
+FINGER = """
+<mujoco>
+  <worldbody>
+    <body name="body_2"><geom size=".01"/><site name="a" pos="0 0 -0.02"/>
+      <body pos="0 0 0.02"><joint name="near" axis="0 1 0" range="-60 90" stiffness="0.1"/><geom size=".01"/>
+        <site name="b" pos="0 0 0.03"/>
+        <body name="far" pos="0 0 0.05">
+          <joint name="far" axis="0 1 0" range="0 90" stiffness="0.05"/><geom size=".01"/>
+          <site name="c" pos="0.01 0 0.02"/>
+        </body>
+      </body>{more}
+    </body>
+  </worldbody>
+  <tendon>
+    <fixed name="t"{limit}><joint joint="near" coef="1"/><joint joint="far" coef="0.8"/></fixed>{tendons}
+  </tendon>
+  <actuator>{actuators}</actuator>
+</mujoco>
+"""
+PULL = '<position name="m" tendon="t" kp="4" ctrlrange="0 2"/>'
+
+
+def finger(folder: Path, actuators: str = PULL, limit: str = "", tendons: str = "", more: str = "") -> Path:
+    text = FINGER.format(actuators=actuators, limit=limit, tendons=tendons, more=more)
+    return written(folder, text)
+
+
+@pytest.mark.parametrize(
+    ("actuators", "limit", "ends", "note"),
+    [
+        (PULL, ' range="-1 1.5"', (0.0, 1.5), "ranges of motors end at the limits of their tendons: m"),
+        ('<general name="m" tendon="t" gainprm="4" biastype="affine" biasprm="2 -4" ctrlrange="0 2"/>', "",
+         (0.5, 2.5), ""),
+        ('<general name="m" tendon="t" gainprm="4" biasprm="0 -4" ctrlrange="0 1"/>', ' range="0 2"', (0, 2),
+         "actuators without position control are taken as rigid, over their whole stroke: m"),
+        ('<intvelocity name="m" tendon="t" kp="4" ctrlrange="-1 1" actrange="0 2"/>', "", (0.0, 2.0), ""),
+        (PULL + '<velocity name="d" tendon="t" kv="0.1"/>', "", (0.0, 2.0),
+         "actuators that move only what others do are left out: d"),
+        (PULL + '<plugin name="p" joint="far" plugin="mujoco.pid"/>', "", (0.0, 2.0),
+         "actuators of plugins are left out: p"),
+    ],
+    ids=["limits of a tendon", "offset", "gain alone", "integrates", "damper", "plugin"],
+)  # fmt: skip
+def test_actuators_of_other_kinds(
+    actuators: str, limit: str, ends: tuple[float, float], note: str, tmp_path: Path
+) -> None:
+    hand = load_hand(finger(tmp_path, actuators, limit))
+    (motor,) = hand.actuators
+    assert (motor.lower, motor.upper) == pytest.approx(ends)
+    assert motor.stiffness == (np.inf if "gainprm" in actuators and "affine" not in actuators else 4.0)
+    assert note in (*hand.notes, "")
+
+
+def test_a_tendon_without_an_arm_at_rest_is_one(tmp_path: Path) -> None:
+    """A band along the finger, which is straight at rest; and one that ties joints, at every posture."""
+    sites = '<site site="a"/><site site="b"/>'
+    band = f'<spatial name="band" stiffness="200" springlength="0 .04">{sites}</spatial>'
+    tie = f'<spatial name="tie" range=".0520 .0521">{sites}<site site="c"/></spatial>'
+    hand = load_hand(finger(tmp_path, tendons=band + tie))
+    model, data = engine(tmp_path / "hand.xml")
+    assert hand.tendon_springs is not None
+    assert hand.loops is not None
+    for q in postures(hand):
+        data.qpos[:] = q
+        mujoco.mj_forward(model, data)
+        pull = 200 * max(0.0, data.ten_length[1] - 0.04)
+        assert hand.tendon_springs.tension(q) == pytest.approx([pull], abs=1e-9)
+        assert hand.loops.gap(q) == pytest.approx([data.ten_length[2] - 0.05205], abs=1e-12)
+
+
+def test_what_is_read_in_part_is_named(tmp_path: Path) -> None:
+    spring = '<fixed name="s" stiffness="1 2" frictionloss="0.1"><joint joint="far" coef="1"/></fixed>'
+    notes = load_hand(finger(tmp_path, tendons=spring)).notes
+    assert "of springs that are not linear the linear part counts: s" in notes
+    assert "friction of tendons is left out: s" in notes
+
+
+def test_replicas_are_made_and_names_are_unique(tmp_path: Path) -> None:
+    """A body without a name took another's, which closed a circle of links without end."""
+    body = '<body name="z"><joint name="z" axis="0 1 0" stiffness=".1"/><geom size=".01"/></body>'
+    more = '<replicate count="{}" offset="0 .02 0">' + body + "</replicate>"
+    hand = load_hand(finger(tmp_path, more=more.format(2)))
+    assert hand.joint_names == ("near", "far", "z0", "z1")
+    assert hand.link_names == ("world", "body_2", "body_2_", "far", "z0", "z1")
+    for count in ("1e300", "inf", "9000"):
+        with pytest.raises(DescriptionError, match="replicas make more than 20000 elements"):
+            load_hand(finger(tmp_path, more=more.format(count)))

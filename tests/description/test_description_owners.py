@@ -57,6 +57,31 @@ def test_inertias_that_no_body_has_are_mended(inertial: str, principal: list[flo
         load_object(tmp_path / "b.urdf")
 
 
+@pytest.mark.parametrize(
+    ("limit", "note"),
+    [
+        ('<limit lower="0" upper="90"/>', "limits beyond a whole turn, in rad; are they in deg?: near"),
+        ('<limit effort="1"/>', "equal limits lock joints: near"),
+    ],
+)
+def test_limits_that_may_be_meant_otherwise_are_named(limit: str, note: str, tmp_path: Path) -> None:
+    """And a joint that is held may have its figures."""
+    slide = '<joint name="rail" type="prismatic"><parent link="base"/><child link="palm"/></joint>'
+    text = FINGER.format(limit=limit, inertial="").replace("</robot>", slide + '<link name="base"/></robot>')
+    (tmp_path / "a.urdf").write_text(text)
+    (tmp_path / "a.transmission.toml").write_text("""[hand]
+name = "a"
+[joints]
+rail = { spring = 0.0 }
+near = { spring = 0.1 }
+[[actuators]]
+name = "m"
+range = [0, 1]
+moment_arms = { near = 1.0 }
+""")
+    assert load_hand(tmp_path / "a.urdf").notes[-1] == note
+
+
 # an arm of one joint and one slide, a leg, and a hand of two joints, one of which is tied to the arm's
 ROBOT = f"""<robot name="robot"><link name="base"/>
   <joint name="lift" type="prismatic"><parent link="base"/><child link="column"/><axis xyz="0 0 1"/>

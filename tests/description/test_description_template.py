@@ -95,12 +95,23 @@ def test_a_transmission_file_overrules_a_mimic(tmp_path: Path) -> None:
     assert "an offset of 11.4592 deg" in load_hand(urdf).notes[0]
 
 
+def test_a_circle_of_mimics_is_opened(tmp_path: Path) -> None:
+    urdf = tmp_path / "mine.urdf"
+    back = '<mimic joint="middle"/><child link="proximal"/>'
+    urdf.write_text(MIMIC.replace('<child link="proximal"/>', back))
+    written = write_template(urdf)
+    written.write_text(filled_in(written))
+    hand = load_hand(urdf)
+    assert hand.coupling.tolist() == [[1.0, -1.0]]
+    assert "in a circle, is left out: middle (of knuckle)" in hand.notes[0]
+
+
 @pytest.mark.parametrize(
     ("mimic", "locked", "note"),
     [
         ('joint="knuckle" multiplier="0" offset="0.2"', True, ""),
         ('joint="slide" multiplier="2" offset="0.2"', True, "does not move is locked: middle"),
-        ('joint="gone"', False, "of no other joint is left out: middle"),
+        ('joint="gone"', False, "of no other joint, or in a circle, is left out: middle"),
     ],
 )
 def test_a_mimic_of_what_does_not_move(mimic: str, locked: bool, note: str, tmp_path: Path) -> None:

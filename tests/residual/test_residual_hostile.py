@@ -271,3 +271,18 @@ def test_a_point_without_effect_makes_no_basis_vector(engine):
     gp.update(torch.tensor([0.2, 1.0], dtype=torch.float64), one)
     assert int(gp.posterior.count) == 1
     assert float(gp.posterior.moments.abs().max()) < 1e3
+
+
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+def test_a_point_far_out_blurs_no_other(engine):
+    """The squares of 1e11 leave nothing of the distances between others, and NaN a few samples later."""
+    learners = [SparseOnlineGP(2, 1, kernel=Matern32(2), parts=(), standardize=False) for _ in range(2)]
+    learners[0].update(torch.tensor([1e11, 0.0], dtype=torch.float64), torch.ones(1, dtype=torch.float64))
+    x = torch.stack([torch.zeros(8), 0.3 * torch.arange(8)], dim=1).double()
+    for learner in learners:
+        if engine == "torch":
+            learner.engine = None
+        learner.update(x, x[:, 1:].sin())
+        learner.refresh()
+    for x_t in x + 0.1:
+        torch.testing.assert_close(learners[0](x_t), learners[1](x_t), rtol=1e-9, atol=1e-12)

@@ -23,7 +23,10 @@ def read_xml(path: Path, what: str, *roots: str) -> ET.Element:
     try:
         root = ET.fromstring(text)  # fetches no external entity, refuses those that blow up
     except (ET.ParseError, ValueError) as error:
-        raise DescriptionError(path, f"not well-formed XML: {error}") from None
+        hint = "; of a file with macros run first: xacro" if "<xacro:" in text else ""
+        raise DescriptionError(path, f"not well-formed XML: {error}{hint}") from None
+    if any("xacro" in element.tag for element in root.iter()):
+        raise DescriptionError(path, f"holds macros; run first: xacro {path} > NEW{path.suffix}")
     if root.tag not in roots:
         raise DescriptionError(path, f"the root element must be <{roots[0]}>, found <{root.tag}>")
     return root

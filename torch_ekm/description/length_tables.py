@@ -14,7 +14,7 @@ from ._toml import TomlTable
 from .connected import PinnedPoints
 from .lengths import ArmFunction, Lengths, Loops, Routed, TendonSprings, typical_arms
 from .mjcf_hand import MjcfHand
-from .mjcf_tendons import RoutedTendons
+from .mjcf_tendons import RoutedTendons, element_name
 from .urdf import UrdfModel
 
 SPRING = ("name", "moment_arms", "mjcf_tendons", "stiffness", "slack")
@@ -154,7 +154,7 @@ class LengthReader:
         if self.mjcf is None:
             raise table.error("'mjcf_tendons' are those of an MJCF, and this hand is none")
         model = self.mjcf.model
-        known = {model.tendon(t).name or f"tendon_{t}": t for t in range(model.ntendon)}
+        known = {element_name(model, "tendon", t): t for t in range(model.ntendon)}
         weights = table.weights("mjcf_tendons")
         for name in weights:
             if name not in known:

@@ -36,23 +36,29 @@ class Mimic:
 def read_mimics(joints: Sequence[Any]) -> tuple[tuple[Mimic, ...], list[str]]:
     """The ``<mimic>`` of all moving joints, of the ``yourdfpy.Joint`` of a file, and notes.
 
-    One that names a joint that does not move locks its joint (multiplier 0); one that names none is left out.
+    One that names a joint that does not move locks its joint (multiplier 0); one that names none, or closes a
+    circle, is left out.
     """
     moving = [joint.name for joint in joints if joint.type != "fixed"]
     still = [joint.name for joint in joints if joint.type == "fixed"]
     found, odd, locked = [], [], []
+    leads = {}  # to the last joint of each chain
     for joint in joints:
         if joint.mimic is None:
             continue
         other, multiplier = joint.mimic.joint, joint.mimic.multiplier
-        if other == joint.name or other not in (*moving, *still):
+        end = other
+        while end in leads:
+            end = leads[end]
+        if end == joint.name or other not in (*moving, *still):
             odd.append(f"{joint.name} (of {other})")
             continue
         if other in still:
             locked.append(f"{joint.name} (of {other})")
             multiplier = 0.0
+        leads[joint.name] = other
         found.append(Mimic(joint.name, other, multiplier, joint.mimic.offset))
-    notes = [listed("each <mimic> of no other joint is left out", odd)] if odd else []
+    notes = [listed("each <mimic> of no other joint, or in a circle, is left out", odd)] if odd else []
     notes += [listed("each <mimic> of a joint that does not move is locked", locked)] if locked else []
     return tuple(found), notes
 

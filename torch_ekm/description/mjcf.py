@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from .._extras import require
+from .._text import figure
 from ..exceptions import DescriptionError
 from ._xml import listed, read_xml
 
@@ -21,7 +22,7 @@ _READ = ("compiler", "option", "default", "worldbody", "tendon", "equality", "ac
 _NOT_READ = {  # of elements that are
     "camera", "light", "plugin", "flag", "material", "texture", "hfield", "skin", "flexcomp", "numeric",
 }  # fmt: skip
-_BUILDS = {"attach", "composite", "replicate"}  # bodies that do not stand in the file
+_BUILDS = {"attach", "composite"}  # bodies that do not stand in the file
 _BOUNDS = {"boundmass": "1e-6", "boundinertia": "1e-12", "balanceinertia": "true"}  # least, kg and kg m^2
 _ATTRIBUTES = ("material", "user")  # that are not read, ...
 _SETTINGS = {  # ... and of elements that only set something, all that is
@@ -49,6 +50,12 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
         if element.tag in _READ:
             strict.append(element)
     notes = [listed("files outside the folder are not read", reader.left_out)] if reader.left_out else []
+    if _made(strict) > _MOST_ELEMENTS:
+        raise DescriptionError(path, f"replicas make more than {_MOST_ELEMENTS} elements")
+    plugins = [one for actuators in strict.iter("actuator") for one in actuators.findall("plugin")]
+    if plugins:
+        named = [one.get("name", one.get("plugin", "")) for one in plugins]
+        notes.append(listed("actuators of plugins are left out", named))
     total = "-1"
     for element in strict.iter():
         total = element.get("settotalmass", total)
@@ -69,6 +76,12 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
         raise DescriptionError(path, "elements are nested too deep") from None
     except (ValueError, RuntimeError) as error:
         raise DescriptionError(path, f"MuJoCo: {' '.join(str(error).split())}") from None
+
+
+def _made(element: ET.Element) -> float:
+    """How many elements there are once all replicas are made."""
+    count = figure(element.get("count", "1")) if element.tag == "replicate" else 1
+    return max(1.0, count or 1.0) * (1 + sum(map(_made, element)))
 
 
 def mjcf_files(path: Path) -> list[Path]:

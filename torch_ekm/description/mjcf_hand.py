@@ -20,10 +20,11 @@ from ..typing import Array
 from ._xml import listed
 from .branch import hand_below
 from .mjcf import compile_mjcf
+from .mjcf_tendons import element_name
 from .mjcf_things import things
 from .mjcf_transmission import MjcfTransmission
 from .shape import Shape
-from .urdf import UrdfJoint, UrdfLink, UrdfModel
+from .urdf import UrdfJoint, UrdfLink, UrdfModel, root_of
 
 _WORLD = "world"
 _LIGHT = 2e-6  # [kg]: MuJoCo's bound, not a body's
@@ -76,7 +77,7 @@ class _Conversion:
         """Notes on several things, and their names."""
         links, joints = self._tree()
         name = model.names[: model.names.index(b"\0")].decode() or path.stem
-        robot = UrdfModel(path, name, tuple(links), tuple(joints), _WORLD)
+        robot = UrdfModel(path, name, tuple(links), tuple(joints), root_of(path, links, joints))
         urdf = hand_below(robot, base, named)
         self.whole = urdf is robot
         self.notes = [*notes, *urdf.notes]
@@ -112,7 +113,7 @@ class _Conversion:
 
     def _tree(self) -> tuple[list[UrdfLink], list[UrdfJoint]]:
         model = self.model
-        names = {b: model.body(b).name or f"body_{b}" for b in range(1, model.nbody)}
+        names = {b: element_name(model, "body", b) for b in range(1, model.nbody)}
         left_out, links, joints = things(model, names), [self._link(_WORLD, 0, np.eye(4))], []
         for b in sorted(left_out & set(model.body_rootid.tolist())):
             self._note("these move and nothing drives them: they are left out", names[b])
@@ -127,7 +128,7 @@ class _Conversion:
             self.held += [(model.joint(j).name or name, name) for j, hinge in kinds if not hinge]
             for k, j in enumerate(hinges):
                 child = name if k == len(hinges) - 1 else f"{name}/{k + 1}"
-                joint = model.joint(j).name or f"joint_{j}"
+                joint = element_name(model, "joint", j)
                 anchor, axis = _pose(model.jnt_pos[j]), model.jnt_axis[j]
                 reference = float(model.qpos0[model.jnt_qposadr[j]])
                 back = _pose(np.zeros(3), self._about(axis, -reference))

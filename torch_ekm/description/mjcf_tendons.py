@@ -11,6 +11,16 @@ from .._extras import require
 from ..typing import Array
 
 
+def element_name(model: Any, kind: str, k: int) -> str:
+    """The name of MuJoCo's k-th body, joint, tendon ...; of one without: a name that no other has."""
+    name = getattr(model, kind)(k).name
+    if not name:
+        name, mj = f"{kind}_{k}", require("mujoco")
+        while mj.mj_name2id(model, getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}"), name) >= 0:
+            name += "_"
+    return name
+
+
 class RoutedTendons:
     """``l(q) = W L(q)``, L the lengths of tendons as MuJoCo measures them.
 

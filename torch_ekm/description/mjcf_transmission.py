@@ -11,7 +11,8 @@ from .._extras import require
 from ..exceptions import DescriptionError
 from ..typing import Array
 from ._toml import TODO
-from .mjcf_tendons import RoutedTendons
+from .lengths import typical_arms
+from .mjcf_tendons import RoutedTendons, element_name
 from .urdf import UrdfModel
 
 _NARROW = (
@@ -65,16 +66,18 @@ class MjcfTransmission:
         Raises:
             DescriptionError: a weld of a part that moves, an equality of tendons that is not linear.
         """
-        found = [self._actuator(k) for k in range(self.model.nu)]
-        actuators = [actuator for actuator in found if actuator is not None]
+        actuators = self._actuators()
         couplings = list(self._equalities())
-        for note, tie in self._tendon_couplings():
+        for t, note, tie in self._tendon_couplings():
             rows = [*self._drives, *(row for _, row, _ in couplings), tie[1]]
-            if np.linalg.matrix_rank(rows) == len(rows):
+            if np.linalg.matrix_rank(rows) < len(rows):
+                note = "tendons that tie joints with motors of their own are left out"
+            elif self._is_fixed(t):
                 couplings.append(tie)
             else:
-                note = "tendons that tie joints with motors of their own are left out"
+                self._loops.append({"name": tie[0], "mjcf_tendons": {tie[0]: 1.0}, "value": tie[2]})
             self._note(note, tie[0])
+        self._note_unread()
         rests, couplings = self._rests(couplings)
         joints = {
             self.names[j]: {
@@ -108,10 +111,36 @@ class MjcfTransmission:
 
     # -- actuators ----------------------------------------------------------------------------------
 
-    def _actuator(self, k: int) -> dict[str, Any] | None:
-        """None: it drives no joint of the hand."""
-        model = self.model
-        name = model.actuator(k).name or f"actuator_{k}"
+    def _actuators(self) -> list[dict[str, Any]]:
+        """Those with position control, and others that move what these do not."""
+        found = [one for k in range(self.model.nu) if (one := self._actuator(k)) is not None]
+        self._drives, kept = [row for table, row in found if "stiffness" in table], []
+        for table, row in found:
+            if "stiffness" not in table:
+                rank = int(np.linalg.matrix_rank(self._drives)) if self._drives else 0
+                if np.linalg.matrix_rank([*self._drives, row]) == rank:
+                    self._note("actuators that move only what others do are left out", table["name"])
+                    continue
+                self._drives.append(row)
+                note = "actuators without position control are taken as rigid, over their whole stroke"
+                self._note(note, table["name"])
+            kept.append(table)
+        return kept
+
+    def _servo(self, k: int) -> tuple[float, Array | None] | None:
+        """Stiffness, and the range of goals as lengths if there is one; None: no position control."""
+        model, mj = self.model, self._mj
+        gain, (start, slope) = model.actuator_gainprm[k, 0], model.actuator_biasprm[k, :2]
+        linear = model.actuator_gaintype[k] == mj.mjtGain.mjGAIN_FIXED
+        if not linear or model.actuator_biastype[k] != mj.mjtBias.mjBIAS_AFFINE or not slope < 0 < gain:
+            return None
+        goals = "act" if model.actuator_dyntype[k] == mj.mjtDyn.mjDYN_INTEGRATOR else "ctrl"
+        limited, ends = (getattr(model, f"actuator_{goals}{what}")[k] for what in ("limited", "range"))
+        return -slope, (start + gain * ends) / -slope if limited else None
+
+    def _actuator(self, k: int) -> tuple[dict[str, Any], Array] | None:
+        """Its table and moment arms; None: it drives no joint of the hand."""
+        model, name = self.model, element_name(self.model, "actuator", k)
         row, offset, gear, tendon = self._driven(k)
         way = None if tendon is None or self._is_fixed(tendon) else tendon
         if not row.any():
@@ -119,16 +148,17 @@ class MjcfTransmission:
                 self._note("actuators that drive no joint of the hand are left out", name)
             return None
         length = self._span(row) + offset if way is None else self._way_span(way, gear)
-        gain, bias = float(model.actuator_gainprm[k, 0]), float(model.actuator_biasprm[k, 1])
         table: dict[str, Any] = {"name": name}
         low, high = model.actuator_forcerange[k] if model.actuator_forcelimited[k] else (-1.0, 1.0)
         pulls_back = high <= 0  # MuJoCo's tendons pull where they shorten; here where `a` grows
-        if bias < 0 < gain:
-            if model.actuator_ctrllimited[k]:
-                length = gain / -bias * model.actuator_ctrlrange[k]
-            table["stiffness"] = -bias
-        else:
-            self._note("actuators without position control are taken as rigid, over their whole stroke", name)
+        if (servo := self._servo(k)) is not None:
+            table["stiffness"] = float(servo[0])
+            length = length if servo[1] is None else servo[1]
+        if tendon is not None and model.tendon_limited[tendon]:
+            ends = np.clip(length, *np.sort(gear * model.tendon_range[tendon]))
+            if ends[0] != ends[1] and not np.allclose(ends, length, rtol=1e-3):
+                length = ends
+                self._note("ranges of motors end at the limits of their tendons", name)
         sign = -1.0 if pulls_back else 1.0
         table["range"] = sorted((sign * length).tolist()) if np.isfinite(length).all() else [TODO, TODO]
         if way is None:
@@ -139,8 +169,7 @@ class MjcfTransmission:
         if tendon is not None and np.abs(row).max() < 0.1:
             counted = "plants and models count in its largest arm"
             self._note(f"these count in the length of their tendon, not in rad; {counted}", name)
-        self._drives.append(row)
-        return table
+        return table, row
 
     def _driven(self, k: int) -> tuple[Array, float, float, int | None]:
         """Moment arms ``(n_q,)`` and length at zero angles of an actuator, its gear and its tendon.
@@ -169,7 +198,7 @@ class MjcfTransmission:
     # -- tendons ------------------------------------------------------------------------------------
 
     def _tendon_name(self, t: int) -> str:
-        return self.model.tendon(t).name or f"tendon_{t}"
+        return element_name(self.model, "tendon", t)
 
     def _parts(self, t: int) -> range:
         return range(self.model.tendon_adr[t], self.model.tendon_adr[t] + self.model.tendon_num[t])
@@ -179,12 +208,11 @@ class MjcfTransmission:
         return all(int(self.model.wrap_type[w]) == joint for w in self._parts(t))
 
     def _tendon(self, t: int) -> tuple[Array, float]:
-        """Moment arms ``(n_q,)`` and length at zero angles: exact for fixed tendons, else at rest."""
+        """Moment arms ``(n_q,)`` and length at zero angles of a fixed tendon; of others typical arms, 0."""
         model = self.model
         if not self._is_fixed(t):
-            rest = self._rest()
-            length, J = RoutedTendons(model, [{t: 1.0}], self.hinges)(rest)
-            return J[0], float(length[0] - J[0] @ rest)
+            routed = RoutedTendons(model, [{t: 1.0}], self.hinges)
+            return typical_arms(routed, self.lower, self.upper, self._rest())[0], 0.0
         row, held = np.zeros(len(self.hinges)), 0.0
         for w in self._parts(t):
             unit = self._unit(int(model.wrap_objid[w]))
@@ -213,7 +241,19 @@ class MjcfTransmission:
                 table["mjcf_tendons"] = {self._tendon_name(t): 1.0}
             yield table | {"stiffness": float(self.model.tendon_stiffness[t]), "slack": ends.tolist()}
 
-    def _tendon_couplings(self) -> Iterator[tuple[str, _Tie]]:
+    def _note_unread(self) -> None:
+        """What has no counterpart."""
+        model = self.model
+        bent = [self.names[j] for j in self.hinges if model.jnt_stiffnesspoly[j].any()]
+        for t in range(model.ntendon):
+            if model.tendon_stiffnesspoly[t].any() and self._tendon(t)[0].any():
+                bent.append(self._tendon_name(t))
+            if model.tendon_frictionloss[t] > 0 and self._tendon(t)[0].any():
+                self._note("friction of tendons is left out", self._tendon_name(t))
+        for name in bent:
+            self._note("of springs that are not linear the linear part counts", name)
+
+    def _tendon_couplings(self) -> Iterator[tuple[int, str, _Tie]]:
         """Tendons that nobody pulls: those that can hardly move tie their joints; with notes."""
         model = self.model
         for t in range(model.ntendon):
@@ -222,11 +262,11 @@ class MjcfTransmission:
             row, offset = self._tendon(t)
             if not row.any():
                 continue
-            shortest, longest = self._span(row)
+            shortest, longest = self._span(row) if self._is_fixed(t) else self._way_span(t, 1.0)
             low, high = model.tendon_range[t].tolist()
             if high - low < _NARROW * (longest - shortest) and (row != 0).sum() > 1:
                 tie = self._tendon_name(t), row, (low + high) / 2 - offset
-                yield "tendons that can hardly move tie their joints", tie
+                yield t, "tendons that can hardly move tie their joints", tie
             else:
                 self._note("limits of tendons are left out", self._tendon_name(t))
 
@@ -236,7 +276,7 @@ class MjcfTransmission:
         """``C q = c``, one row for each equality that is linear; the others are loops."""
         model, kinds = self.model, self._mj.mjtEq
         for e in np.flatnonzero(model.eq_active0).tolist():
-            kind, name = int(model.eq_type[e]), model.equality(e).name or f"equality_{e}"
+            kind, name = int(model.eq_type[e]), element_name(model, "equality", e)
             first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
             if kind != kinds.mjEQ_JOINT and kind != kinds.mjEQ_TENDON:
                 self._pinned(e, kind, name)

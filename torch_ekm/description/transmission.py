@@ -16,13 +16,14 @@ import numpy as np
 from ..exceptions import DescriptionError, JointMismatchError
 from ..typing import Array
 from ._toml import TODO, TomlTable, read_toml
+from ._xml import listed
 from .branch import hand_below
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .length_tables import LOOP, SPRING, LengthReader
 from .lengths import Lengths, Loops, TendonSprings
 from .mimic import overruled, unheld_joints
 from .mjcf_hand import MjcfHand
-from .urdf import UrdfModel
+from .urdf import UrdfJoint, UrdfModel
 
 TABLES = (
     "hand", "joints", "actuators", "couplings", "tendon_springs", "loops", "pads", "hall_sensors", "notes",
@@ -36,6 +37,7 @@ ACTUATOR = (
 COUPLING = ("name", "joints")
 PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
 HALL = ("joint", "channel", "open", "closed")
+_TURN = 6.3  # [rad]
 T = TypeVar("T")
 
 
@@ -67,15 +69,15 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     names = tuple(joint.name for joint in joints)
     if not names:
         raise hand.error(f"base_link '{base}' carries no revolute or continuous joint")
-    springs = _joint_table(path, given, names, {joint.name for joint in robot.moving_joints})
+    springs = _joint_table(path, given, names, {joint.name for joint in robot.joints})
     mechanism = _mechanism(top, LengthReader(urdf, names, springs[:, 1], mjcf), springs[:, 0])
     actuators = [_actuator(table) for table in mechanism.motors]
     J_a, C = mechanism.lengths.typical, mechanism.C
-    notes = overruled(urdf.mimics, names, C, springs[:, 1])
+    notes = [*overruled(urdf.mimics, names, C, springs[:, 1]), *_odd_limits(joints, C)]
+    _check_unique(path, "actuator", [actuator.name for actuator in actuators])
     _check_mechanism(path, mechanism)
     pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
     hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
-    _check_unique(path, "actuator", [actuator.name for actuator in actuators])
     _check_unique(path, "pad", [pad.name for pad in pads])
     _check_unique(path, "Hall channel", [str(sensor.channel) for sensor in hall])
     normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
@@ -117,6 +119,8 @@ class _Mechanism:
     motors: list[TomlTable]
     lengths: Lengths
     C: Array
+    tied: tuple[str, ...]
+    """Names of its rows."""
     tendon_springs: TendonSprings | None
     loops: Loops | None
 
@@ -145,6 +149,7 @@ def _mechanism(top: TomlTable, reader: LengthReader, spring: Array) -> _Mechanis
         motors=motors,
         lengths=reader.lengths(motors),
         C=_rows(top.path, reader.names, weights),
+        tied=tuple(table.text("name") for table in couplings),
         tendon_springs=reader.springs(each("tendon_springs", SPRING)),
         loops=reader.loops(each("loops", LOOP)),
     )
@@ -177,7 +182,7 @@ def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
 
     left = [place for key, value in data.items() for place in places(value, key)]
     if left:
-        raise DescriptionError(path, f"still to be filled in: {', '.join(left)}")
+        raise DescriptionError(path, f"still to be filled in: {', '.join(left)}{_where(path)}")
 
 
 def _each(top: TomlTable, key: str, read: Callable[[str, Any], T]) -> list[T]:
@@ -276,17 +281,32 @@ def _check_mechanism(path: Path, mechanism: _Mechanism) -> None:
     if not len(J_a):
         raise DescriptionError(path, "[[actuators]]: at least 1 such table(s) must be given")
     B = np.vstack([J_a, C])
-    singular = np.linalg.svd(B, compute_uv=False)
+    U, singular, _ = np.linalg.svd(B)
     rank = int((singular > 1e-9 * singular[0]).sum())
     if rank < len(B):
+        names = [*(table.text("name") for table in mechanism.motors), *mechanism.tied]
+        alike = [name for name, part in zip(names, np.abs(U[:, rank:]), strict=True) if part.max() > 1e-6]
         parts = f"{len(J_a)} actuators and {len(C)} couplings give only {rank} independent rows"
+        parts = f"{parts}; one or more of these move nothing of their own: {', '.join(alike)}"
         raise DescriptionError(path, f"moment arms and couplings must be linearly independent: {parts}")
     if loose := mechanism.unheld:
         problem = f"no spring, actuator or coupling holds the joints {', '.join(loose)}"
-        problem += ": give them a positive 'spring' in [joints]"
-        if path.suffix != ".toml":
-            problem += f" of a transmission file; 'torch-ekm hands --new {path}' writes one"
+        problem += f": give them a positive 'spring' in [joints]{_where(path)}"
         raise DescriptionError(path, problem)
+
+
+def _where(path: Path) -> str:
+    """What an MJCF does not say stands in a file next to it."""
+    remedy = f" of a transmission file; 'torch-ekm hands --new {path}' writes one"
+    return "" if path.suffix == ".toml" else remedy
+
+
+def _odd_limits(joints: Iterable[UrdfJoint], C: Array) -> list[str]:
+    """Notes on limits that may be meant otherwise: in degrees, or left out."""
+    wide = [j.name for j in joints if _TURN < max(-j.lower, j.upper) < np.inf]
+    still = [j.name for k, j in enumerate(joints) if j.lower == j.upper and not (C[:, k] != 0).any()]
+    notes = [listed("limits beyond a whole turn, in rad; are they in deg?", wide)] if wide else []
+    return notes + ([listed("equal limits lock joints", still)] if still else [])
 
 
 def _check_unique(path: Path, kind: str, names: Iterable[str]) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -157,7 +158,7 @@ def read_urdf(path: str | Path) -> UrdfModel:
     mended: list[str] = []
     links = tuple(_link(path, link, mended) for link in robot.links)
     joints = tuple(_joint(path, joint) for joint in robot.joints)
-    base = _root(path, links, joints)
+    base = root_of(path, links, joints)
     mimics, notes = read_mimics(robot.joints)
     if held:
         notes.append(listed("joints that slide or float are held at 0", held))
@@ -181,7 +182,7 @@ def _strict_joint(path: Path, element: ET.Element) -> ET.Element:
         valid = "revolute, continuous and fixed"
         raise DescriptionError(path, f"{place}: type '{kind}' is not supported; supported: {valid}")
     if kind == "revolute" and element.find("limit") is None:
-        raise DescriptionError(path, f"{place}: <joint> needs a <limit>")
+        raise DescriptionError(path, f"{place}: <joint> needs a <limit> [rad], or type 'continuous'")
     unread = {"revolute": (), "continuous": ("limit",), "fixed": ("axis", "limit", "mimic")}
     strict = _strict(path, element, place, unread[kind])
     strict.set("type", kind)
@@ -306,7 +307,7 @@ def _pose(origin: Array | None) -> Array:
     return np.eye(4) if origin is None else origin
 
 
-def _root(path: Path, links: tuple[UrdfLink, ...], joints: tuple[UrdfJoint, ...]) -> str:
+def root_of(path: Path, links: Sequence[UrdfLink], joints: Sequence[UrdfJoint]) -> str:
     """The one link without a parent; every other link must be reached from it."""
     names = [link.name for link in links]
     if not names:

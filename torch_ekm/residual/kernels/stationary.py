@@ -15,8 +15,10 @@ from .kernel import Kernel, log_parameter
 
 def squared_distances(x: Float[Tensor, "*any n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
     """``|x_i - z_j|^2``, ``(*batch, n, m)``."""
-    if x.shape[-2] == 1:  # differences are exact; products are faster for many queries
-        return (z - x).square().sum(-1).unsqueeze(-2)
+    # differences are exact, as a basis needs it, one point of which may lie at 1e11; products are faster for
+    # many queries, and need less memory on a GPU
+    if x.shape[-2] == 1 or (x is z and not x.is_cuda):
+        return (z.unsqueeze(-3) - x.unsqueeze(-2)).square().sum(-1)
     # about one of the points: far from 0 the difference of large squares would be all rounding
     centre = z[..., :1, :].detach()
     x, z = x - centre, z - centre
@@ -76,7 +78,8 @@ class StationaryKernel(Kernel):
 
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         w = self.log_lengthscale.neg().exp().unsqueeze(-2)
-        d2 = squared_distances(x * w, z * w)
+        scaled = x * w
+        d2 = squared_distances(scaled, scaled if z is x else z * w)
         return self.log_variance.exp()[..., None, None] * self.phi(d2)
 
     def diagonal(self, x: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from .numba_memory import vector_at as at
 #: what a kernel's ``kind`` means
 SQUARED_EXPONENTIAL, MATERN32 = 0, 1
 _FAR = 1e10  # squared scaled distance beyond which a kernel is 0
+_LARGE = 1e7  # square whose rounding, 1e-9, is a distance between points that nearly coincide
 
 
 @inner(types.void(I1, INT, A2))
@@ -185,12 +186,17 @@ def kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal):
     """See :func:`kernel_row`, of many points q; their k(q, q) into ``diagonal``."""
     N, M, n_s = q.shape[0], basis.shape[0], q.shape[1] - p[P.ACTIONS]
     # about one of the points: far from 0 the difference of large squares would be all rounding
-    a, c, a2, c2 = np.empty((N, n_s)), np.empty((M, n_s)), np.zeros(N), np.zeros(M)
+    a, c, a2, c2, far = np.empty((N, n_s)), np.empty((M, n_s)), np.zeros(N), np.zeros(M), 0.0
     for of, to, squares in ((q, a, a2), (basis, c, c2)):
         for i in range(of.shape[0]):
             for j in range(n_s):
                 to[i, j] = of[i, j] - basis[0, j]
             squares[i] = dot(to[i], to[i], n_s)
+            far = max(far, squares[i])
+    if far > _LARGE:  # that one, or others, lie far out: differences are exact
+        for i in range(N):
+            diagonal[i] = kernel_row(p, own, q[i], basis, active, k[i], psi[i], phi[i])
+        return
     k[:, :] = 0.0
     add_products(a, c, -2.0, k, False, False)
     for i in range(N):
