@@ -197,10 +197,10 @@ def test_a_topic_that_cannot_be_read_is_left_out_unless_it_is_asked_for(ros, tmp
     table = read_bag(path, "/q")
     assert table.names == ("/q.position.a", "/q.position.b")
     assert table.notes[0].startswith("/odd (sensor_msgs/msg/JointState) cannot be read: ")
-    with pytest.raises(DescriptionError, match="/odd .* has the name 'c' twice"):
+    with pytest.raises(DescriptionError, match=r"/odd .* has the name 'c' twice"):
         read_bag(path, "/q", ["/odd"])
     (path / "metadata.yaml").unlink()
-    with pytest.raises(DescriptionError, match="without metadata.yaml"):
+    with pytest.raises(DescriptionError, match=r"without metadata\.yaml"):
         read_bag(path, "/q")
 
 

@@ -27,7 +27,7 @@ _INDEXED = re.compile(r"(.+)\[([0-9]{1,4})\]")
 _TIME = re.compile(  # also %time of ROS 1, __time of PlotJuggler, header.stamp
     r"(.*[./])?[%_]*(time|timestamp|stamp)([ _]?[\[(]?(s|ms|us|ns|sec|seconds)[\])]?)?", re.IGNORECASE
 )
-_TIME_WORD = re.compile(  # in a name, such as sim_time, rosbagTimestamp, t [s]; nanosec begins anew each second
+_TIME_WORD = re.compile(  # in a name, as sim_time, rosbagTimestamp, t [s]; nanosec begins anew each second
     r"(?!.*n(ano)?sec)((.*[./])?t|(.*[^a-z])?([a-z]*time|[a-z]*stamp|secs?|seconds?|elapsed|clock))([^a-z].*)?",
     re.IGNORECASE,
 )
