@@ -300,7 +300,7 @@ def _lines(text: str) -> dict[str, dict[str, int]]:
     found: dict[str, dict[str, int]] = {}
     count: dict[str, int] = {}
     table = found.setdefault("", {})
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):
         if (head := _HEADER.match(line)) is not None:
             name = head[2]
             if head[1] == "[[":
