@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+import threading
 import weakref
 from collections.abc import Iterator
 from io import BufferedReader
@@ -112,8 +113,8 @@ def told_as_output_error(path: str | Path) -> Iterator[None]:
     """What the system refuses while ``path`` is written is an OutputError."""
     try:
         yield
-    except OSError as error:
-        raise OutputError(path, error.strerror or error) from error
+    except (OSError, ValueError) as error:  # a name that no file can have
+        raise OutputError(path, getattr(error, "strerror", None) or error) from error
 
 
 def make_folder(folder: Path) -> None:
@@ -127,13 +128,18 @@ def make_folder(folder: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
-    """Write a file that appears whole or not at all, and is safe on the disk when this returns.
+    """Write a file that appears whole or not at all, and is safe on the disk when this returns. A link stays
+    one, and what was at its end is replaced.
 
     Raises:
-        OutputError: it cannot be written; the file is what it was.
+        OutputError: it cannot be written, or is a folder, a pipe or a device; it is what it was.
     """
-    part = path.with_name(path.name + ".part")
     with told_as_output_error(path):
+        path = Path(os.path.realpath(path))
+        if path.exists() and not path.is_file():
+            raise OutputError(path, "it is no file but a folder, a pipe or a device")
+        # two who write it at once must not write into each other
+        part = path.with_name(f"{path.name}.{os.getpid()}.{threading.get_ident():x}.part")
         try:
             with part.open("wb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)

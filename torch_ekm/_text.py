@@ -26,7 +26,7 @@ def decode(content: bytes, path: str | os.PathLike) -> str:
     bad = content.find(b"\0")  # of every second letter in UTF-16
     if bad < 0:
         try:
-            return content.decode("utf-8-sig")
+            return content.decode().lstrip("\ufeff")  # two, where files were joined
         except UnicodeDecodeError as error:
             bad = error.start
     line = content.count(b"\n", 0, bad) + 1

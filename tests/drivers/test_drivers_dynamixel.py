@@ -147,6 +147,7 @@ def test_a_servo_that_has_switched_off_says_why(bus, tmp_path) -> None:
     [
         ("baud =|mode = 1\nbaud =", 7, "'mode' must be 3, 4 or 5 (positions), got 1"),
         ("baud =|current_ma = 6000\nbaud =", 7, "'current_ma' must be at most 3209.17, got 6000"),
+        ("baud =|current_ma = 0\nbaud =", 7, "'current_ma' must be positive, got 0"),
         ("id = 1|id = 253", 17, "[[motors]] 'left': 'id' must be at most 252, got 253"),
         ("[limits]|[[joints]]\nname = 'left_0'\nid = 3\n[limits]", 20, "servos report no [[joints]]"),
     ],

@@ -275,9 +275,33 @@ def test_a_pose_by_best_effort_is_heard(stamped, robot, path) -> None:
     with Ros2Plant(path) as driver:
         seen = WithPose(driver, RosPose(driver, "/seen", "camera"), patience=2.0).reset(seed=0)
         torch.testing.assert_close(seen.position, radians(0.0, 0.1, 0.0))
-        none = WithPose(driver, RosPose(driver, "/other", "camera"), patience=2.0)
+        pose = WithPose(driver, RosPose(driver, "/other", "camera"), patience=2.0)
         with pytest.raises(BusError, match="/other: no node publishes it"):
-            none.reset(seed=0)
+            pose.reset(seed=0)
+        with pytest.raises(BusError, match=r"/two words: Invalid topic name"):
+            RosPose(driver, "/two words", "camera")
+
+
+def test_what_is_sent_as_another_type_is_named_by_it(robot, path, monkeypatch) -> None:
+    """The controller takes an array, and the camera's node sends a pose alone."""
+    from geometry_msgs.msg import Pose
+    from std_msgs.msg import Float64MultiArray
+
+    monkeypatch.setattr("torch_ekm.drivers.ros2._TIMEOUT", 2.0)
+    node = robot.node("node_0")
+    robot.says(node, **BOTH)
+    node.create_publisher(Pose, "/other", 1)
+    node.create_subscription(Float64MultiArray, "/array", lambda _: None, 1)
+    path.write_text(path.read_text().replace("/hand/joint_trajectory", "/array"))
+    with pytest.raises(
+        BusError, match="/array: its subscriptions are of std_msgs/msg/Float64MultiArray, not"
+    ):
+        Ros2Plant(path)
+    path.write_text(path.read_text().replace("[limits]", 'kind = "array"\n[limits]'))
+    with Ros2Plant(path) as driver:
+        pose = WithPose(driver, RosPose(driver, "/other", "camera"), patience=2.0)
+        with pytest.raises(BusError, match="/other: its publishers are of geometry_msgs/msg/Pose, not of"):
+            pose.reset(seed=0)
 
 
 def test_two_cameras_on_one_topic_are_named(robot, path) -> None:

@@ -34,6 +34,13 @@ def test_channels_are_in_the_order_of_the_description(tmp_path) -> None:
     assert wiring.line("motors", "left", "sign") == 15  # not given: where the motor begins
 
 
+def test_places_in_a_message_are_numbers_or_texts(tmp_path) -> None:
+    text = T42 + '[[fingertips]]\nname = "left"\nid = 1\n[[fingertips]]\nname = "right"\nid = "0"\n'
+    text = text.replace("id = 2", 'id = "2"')
+    wiring = Wiring.read(write(tmp_path, text), "dynamixel", 100.0, ("port", "baud"), named=True)
+    assert [one.id for one in (*wiring.motors, *wiring.fingertips)] == ["1", "2", "1", "0"]
+
+
 FAULTS = {  # what is changed; line, words
     "unknown key": ("sign = -1|sing = -1", 12, "unknown key 'sing'; valid keys are: name, id"),
     "unknown table": ("[limits]|[limit]", 20, "unknown key 'limit'"),
@@ -50,6 +57,8 @@ FAULTS = {  # what is changed; line, words
     "negative rate": ("rate_deg = 200|rate_deg = -1", 22, "must be positive"),
     "limit in deg": ("increment_deg = 20|increment = 20", 21, "must be at most 3.14 rad, got 20"),
     "rest in deg": ("rate_deg = 200|still = 0.2", 22, "'still' must be at most 0.1 rad"),
+    "rest in ms": ("still_for = 0.05|still_for = 50", 23, "'still_for' must be at most 10 s, got 50"),
+    "period in ms": ("rate_deg = 200|period = 20", 22, "'period' must be at most 2 s, got 20"),
     "text for a number": ("zero = 1000|zero = '1000'", 18, "must be a finite number"),
     "no such hand": ('"yale_t42"|"yale_t43"', 3, "unknown hand 'yale_t43'; valid are: icub_right"),
     "another driver": ('"dynamixel"|"yarp"', 2, "this is the driver 'dynamixel'"),

@@ -250,3 +250,14 @@ def test_a_wiring_is_tried_without_its_bus(driver, tmp_path) -> None:
     done = CliRunner().invoke(app, ["check", "--plant", str(path), "--emulate", "--dry-run"])
     unit = {"yarp": "deg", "ros2": "rad"}[driver]
     assert f" {unit} = " in done.output
+
+
+@pytest.mark.parametrize("change", ['zero =|"zero" =', "as guessed|as\u2028guessed", "\n|\r\n"])
+def test_zeros_are_written_where_they_stand_whoever_wrote_the_file(change: str, tmp_path) -> None:
+    path, (old, new) = tmp_path / "own.toml", change.split("|")
+    path.write_bytes(TEXT.replace("PORT", "none").replace(old, new).encode())
+    n = path.read_bytes().count(b"\r\n")
+    given = DynamixelPlant.wired(path)
+    write_zeros(given, [Taut(one.name, 1234.0, 0.1) for one in given.motors])
+    assert [one.zero for one in DynamixelPlant.wired(path).motors] == [1234.0] * len(given.motors)
+    assert path.read_bytes().count(b"\r\n") == n

@@ -119,6 +119,7 @@ def test_nothing_is_held_for_ever(ros, tmp_path) -> None:
     heard: list[Heard] = []
     for k in range(100):
         t = 1 + 0.02 * k
+        heard.append((t, "/js", ros.joints(t, "a", [k], [3.0] if k < 50 else [])))
         heard.append((t, "/forces", ros.array(*([3.0] if k < 50 else [4.0, 5.0] if k >= 70 else []))))
         if k < 60:
             heard.append((t, "/dies", ros.array(k)))
@@ -131,6 +132,7 @@ def test_nothing_is_held_for_ever(ros, tmp_path) -> None:
         [3, np.nan, np.nan, 4], nan_ok=True
     )
     assert np.isnan(column(table, "/forces.data[1]")[:70]).all()
+    assert column(table, "/js.effort.a")[[49, 50]] == pytest.approx([3, np.nan], nan_ok=True)
     assert column(table, "/dies.data[0]")[[59, 68, 70]] == pytest.approx([59, 59, np.nan], nan_ok=True)
     assert np.isnan(column(table, "/pauses.data[0]")[46:60]).all()
     assert column(table, "/pauses.data[0]")[[29, 39, 60]].tolist() == [29, 29, 60]
@@ -172,6 +174,50 @@ def test_a_simulation_that_was_reset_is_two_runs(kind: str, tmp_path) -> None:
     assert table.notes == ("2 runs: a clock was set back",)
     own = load_own(path, Columns(["/q.data[0]"], ["/u.data[0]"], ["/q.data[0]"]), clock="/q")
     assert own.y[:, 0].tolist() == [1.0] * 118
+
+
+@pytest.mark.parametrize(("step", "n", "runs"), [(0.001, 80, 4), (1.0, 8, 10), (0.02, 5, 20)])
+def test_runs_may_be_short(step: float, n: int, runs: int, ros, tmp_path) -> None:
+    heard = [(1 + step * k, "/u", ros.array(1000 * run + k)) for run in range(runs) for k in range(n)]
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/u.data[0]").tolist() == [1000 * run + k for run in range(runs) for k in range(n)]
+    assert table.run.tolist() == [run for run in range(runs) for _ in range(n)]
+
+
+def test_a_stamp_from_the_future_begins_no_run(ros, tmp_path) -> None:
+    heard = [(1 + 0.02 * k, "/q", ros.joints(1 + 0.02 * k + 500 * (k == 50), "a", [k])) for k in range(99)]
+    assert not read_bag(ros.write(tmp_path, heard), "/q").run.any()
+
+
+def test_a_topic_that_cannot_be_read_is_left_out_unless_it_is_asked_for(ros, tmp_path) -> None:
+    """A camera's messages of a type that is not there, say; here a name stands twice."""
+    heard = [(t, topic, ros.joints(t, names, [1, 2]))
+             for t in range(1, 60) for topic, names in (("/q", "ab"), ("/odd", "cc"))]  # fmt: skip
+    path = ros.write(tmp_path, heard)
+    table = read_bag(path, "/q")
+    assert table.names == ("/q.position.a", "/q.position.b")
+    assert table.notes[0].startswith("/odd (sensor_msgs/msg/JointState) cannot be read: ")
+    with pytest.raises(DescriptionError, match=r"/odd .* has the name 'c' twice"):
+        read_bag(path, "/q", ["/odd"])
+    (path / "metadata.yaml").unlink()
+    with pytest.raises(DescriptionError, match=r"without metadata\.yaml"):
+        read_bag(path, "/q")
+
+
+def test_transforms_are_called_by_their_frames(ros, tmp_path) -> None:
+    """Two nodes, one transform each, on one topic."""
+    turn = ros.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+    heard: list[Heard] = []
+    for k in range(40):
+        for name, x in (("object", float(k)), ("palm", -1.0)):
+            moved = ros.make(
+                "geometry_msgs/msg/Transform", ros.make("geometry_msgs/msg/Vector3", x, 0.0, 0.0), turn
+            )
+            one = ros.make("geometry_msgs/msg/TransformStamped", ros.header(1 + 0.1 * k), name, moved)
+            heard.append((1 + 0.1 * k, "/tf", ros.make("tf2_msgs/msg/TFMessage", [one])))
+        heard.append((1.01 + 0.1 * k, "/u", ros.array(k)))
+    table = read_bag(ros.write(tmp_path, heard), "/u")
+    assert column(table, "/tf.transforms.object.transform.translation.x").tolist() == [*range(40)]
 
 
 def test_stamps_that_fall_are_a_reset_only_where_they_are_one_clock(ros, tmp_path) -> None:
@@ -258,9 +304,11 @@ def test_rows_are_in_the_order_of_time_whoever_wrote_them(ros, tmp_path) -> None
     assert not table.run.any()
 
 
-@pytest.mark.parametrize(
-    "name", ["time [s]", "%time", "__time", "/joint_states/header.stamp", "timestamp_ns"]
-)
+TIMES = ["time [s]", "%time", "__time", "/joint_states/header.stamp", "timestamp_ns"]
+MAYBE = ["t", "t [s]", "sim_time", "header_stamp", "rosbagTimestamp", "Elapsed Time (s)", "stamp.secs"]
+
+
+@pytest.mark.parametrize("name", [*TIMES, *MAYBE])
 def test_a_time_in_a_csv_that_goes_back_begins_a_run(name, tmp_path) -> None:
     rows = [f"{0.1 * k:.3f},{1000 * run + k},1" for run in (0, 1) for k in range(50)]
     path = tmp_path / "own.csv"
@@ -270,7 +318,18 @@ def test_a_time_in_a_csv_that_goes_back_begins_a_run(name, tmp_path) -> None:
     assert own.notes == f" 2 runs: column '{name}' goes back."
     path.write_text("\n".join([f"{name},q,u", *rows[::-1]]))
     own = load_own(path, Columns(["q"], ["u"], ["q"]))
-    assert f"'{name}' goes back in 98 of 100 rows, first in row 2" in own.notes
+    assert (f"'{name}' goes back in 98 of 100 rows, first in row 2" in own.notes) == (name in TIMES)
+
+
+def test_each_time_in_a_csv_may_begin_a_run_and_what_only_sounds_like_one_does_not(tmp_path) -> None:
+    """A log's time grows while the stamp of a simulation goes back after each eight rows; x_t swings."""
+    rows = [(0.1 * (8 * r + k), 0.1 * k, k, 1000 * r + k, (-1) ** k) for r in range(12) for k in range(8)]
+    path = tmp_path / "own.csv"
+    table = "\n".join(",".join(f"{x:g}" for x in row) for row in rows)
+    path.write_text(f"time,header.stamp,nanosec,q,x_t\n{table}")
+    own = load_own(path, Columns(["q"], ["x_t"], ["q"]))
+    assert own.y[:, 0].tolist() == [1.0] * 84
+    assert own.notes == " 12 runs: column 'header.stamp' goes back."
 
 
 @pytest.mark.parametrize("end", ["", ".csv", ".mcap", ".db3"])

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 from fakes import FakePlant
 from made_up import trajectory
 
+from torch_ekm._files import write_whole
 from torch_ekm.description.registry import file_digests, object_paths
 from torch_ekm.exceptions import (
     DescriptionError,
@@ -286,3 +288,25 @@ def test_a_full_disk_is_told_and_leaves_the_log_as_it_was(tmp_path: Path) -> Non
     assert sorted(contents(tmp_path)) == [".lock", "trial_000000.h5"]
     make(tmp_path)
     assert wrong(tmp_path) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links and pipes")
+def test_what_is_no_file_is_not_replaced_and_a_link_stays_one(tmp_path: Path) -> None:
+    file, link, pipe = tmp_path / "file", tmp_path / "link", tmp_path / "pipe"
+    link.symlink_to(file)
+    write_whole(link, "whole")
+    assert (link.is_symlink(), file.read_text()) == (True, "whole")
+    os.mkfifo(pipe)
+    for path in (pipe, tmp_path, Path(""), tmp_path / "n\0n"):
+        with pytest.raises(OutputError):
+            write_whole(path, "lost")
+    assert pipe.is_fifo()
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["file", "link", "pipe"]
+
+
+def test_two_may_write_one_file_at_once(tmp_path: Path) -> None:
+    path, texts = tmp_path / "file", ["a" * 200_000, "b" * 100_000]
+    with ThreadPoolExecutor(2) as both:
+        list(both.map(lambda k: write_whole(path, texts[k % 2]), range(60)))
+    assert path.read_text() in texts
+    assert list(tmp_path.iterdir()) == [path]

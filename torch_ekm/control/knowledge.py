@@ -210,5 +210,4 @@ class HandKnowledge(Recorded, nn.Module):
 
 def previous(path: str | os.PathLike) -> Path:
     """Where :meth:`HandKnowledge.save` keeps the file that it replaces."""
-    path = Path(path)
-    return path.with_name(f"{path.name}.previous")
+    return Path(path).parent / f"{Path(path).name}.previous"

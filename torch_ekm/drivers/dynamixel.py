@@ -142,7 +142,7 @@ class DynamixelPlant(HandDriver):
         """Mode and current; what these servos do not have, or do not allow, is refused."""
         bus = self.wiring.bus
         mode = bus.whole("mode", min(max(one.modes) for one in self._models))
-        current_ma = bus.number("current_ma", 0.0, minimum=0.0)
+        current_ma = bus.number("current_ma", 0.0, positive=True)
         for one, model, found in zip(self.wiring.motors, self._models, self._found, strict=True):
             name = f"motor '{one.name}' is a servo {model.name}"
             if mode not in model.modes:

@@ -149,5 +149,5 @@ class Gathered:
         """Which of these nobody sends, and what is sent instead."""
         missing = ", ".join(f"'{name}'" for name in names if (part, name) not in self._values)
         if not self.heard:
-            return "nothing is received: is its publisher running?"
+            return "nothing is received"
         return f"has no {part} of {missing}; it has: {', '.join(self.heard)}"

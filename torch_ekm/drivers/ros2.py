@@ -5,7 +5,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from .wiring import Channel
 _KINDS = ("trajectory", "array", "joint_state")
 _TIMEOUT = 5.0  # [s] for the first message and the first subscriber: discovery takes a while
 _DISCOVERED = 0.4  # [s] by then a node that runs is known
-_ONLY_RELIABLE = " ([bus] reliable = true hears reliable publishers only)"
+_ONLY_RELIABLE = "; [bus] reliable = true hears reliable publishers only"
 _POSE = ("x", "y", "z", "orientation.x", "orientation.y", "orientation.z", "orientation.w")
 _SYNCHRONOUS = 0.02  # [s] of clocks: less is not worth a note
 
@@ -79,24 +79,25 @@ class Ros2Plant(HandDriver):
         self.node = rclpy.create_node("torch_ekm", context=self._context, parameter_overrides=parameters)
         """For further subscriptions, such as :class:`RosPose`."""
         policy = qos.ReliabilityPolicy
-        reliable = bus.flag("reliable", False)
+        self._reliable = bus.flag("reliable", False)
         self._quality = qos.QoSProfile(  # a depth of 1 would drop what two nodes send at once
-            depth=50, reliability=policy.RELIABLE if reliable else policy.BEST_EFFORT
+            depth=50, reliability=policy.RELIABLE if self._reliable else policy.BEST_EFFORT
         )
         self._ids = [str(one.id) for one in (*self.wiring.motors, *self.wiring.joints)]
         self._states = self.gathered(self._states_topic, self._ids)
         self.subscribe(self._messages["sensor"].JointState, self._states_topic, self._take)
         self._taxels = [self._places(one) for one in self.wiring.fingertips]
+        array = self._messages["std"].Float64MultiArray
         if self._taxels:
             self._forces = self.gathered(
                 bus.text("fingertips"), [k for taxels in self._taxels for k in taxels]
             )
-            array = self._messages["std"].Float64MultiArray
             self.subscribe(array, self._forces.topic, self._take_force)
         kind = {"trajectory": self._messages["trajectory"].JointTrajectory,
-                "array": self._messages["std"].Float64MultiArray,
+                "array": array,
                 "joint_state": self._messages["sensor"].JointState}[self._kind]  # fmt: skip
-        self._publisher = self.node.create_publisher(kind, topic, 1)
+        with _told(topic):
+            self._publisher = self.node.create_publisher(kind, topic, 1)
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
@@ -104,21 +105,21 @@ class Ros2Plant(HandDriver):
         try:
             if not self.dry_run:
                 self._master = OneMaster(f"{topic} of domain {os.environ.get('ROS_DOMAIN_ID', 0)}")
-            quality = _ONLY_RELIABLE if reliable else ""
+            states = self._messages["sensor"].JointState
             self._first(
                 lambda: None not in self._newest("position", self._ids),
-                lambda: self._states.absent("position", self._ids) + quality,
+                lambda: self._absent(self._states, "position", self._ids, states),
                 self._states_topic,
             )
             for taxels in self._taxels:
                 self._first(
                     lambda taxels=taxels: None not in self._pressed(taxels),
-                    lambda taxels=taxels: self._forces.absent("force", taxels) + quality,
+                    lambda taxels=taxels: self._absent(self._forces, "force", taxels, array),
                     self._forces.topic,
                 )
             self._first(
                 lambda: self.dry_run or self._publisher.get_subscription_count() > 0,
-                lambda: "no node subscribes to it: is the controller running?",
+                lambda: self.lacks(topic, kind, "subscriptions"),
                 topic,
             )
             # a node of our own name may be one that was killed: it stays in the graph for some seconds
@@ -148,7 +149,23 @@ class Ros2Plant(HandDriver):
         """``take`` gets each message and its sender as the middleware states it, in the wiring's quality."""
         informs = hasattr(require("rclpy.subscription").Subscription, "CallbackType")  # since ROS 2 Iron
         back = take if informs else lambda message: take(message, {})
-        self.node.create_subscription(kind, topic, back, self._quality)
+        with _told(topic):
+            self.node.create_subscription(kind, topic, back, self._quality)
+
+    def lacks(self, topic: str, kind: Any, what: str = "publishers") -> str:
+        """Why messages of a kind do not pass on a topic; "": it has publishers or subscriptions for them."""
+        own = f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
+        types = {one.topic_type for one in getattr(self.node, f"get_{what}_info_by_topic")(topic)}
+        if not types:
+            verb = "publishes" if what == "publishers" else "subscribes to"
+            return f"no node {verb} it: is there one running?"
+        return "" if own in types else f"its {what} are of {', '.join(sorted(types))}, not of {own}"
+
+    def _absent(self, gathered: Gathered, part: str, names: Sequence[str], kind: Any) -> str:
+        said = gathered.absent(part, names)
+        if not gathered.heard and (problem := self.lacks(gathered.topic, kind)):
+            said += f": {problem}"
+        return said + (_ONLY_RELIABLE if self._reliable else "")
 
     def publishers(self, topic: str) -> list[tuple[str, bytes]]:
         """Nodes that publish a topic, and by which id; names come a little later than messages."""
@@ -175,8 +192,8 @@ class Ros2Plant(HandDriver):
         """For what comes by a topic; its publishers are called by their nodes."""
 
         def called(sender: Any) -> str:
-            there = {gid: name for name, gid in self.publishers(topic)}
-            return f"node {there[sender]}" if sender in there else f"a node ({sender!r})"
+            name = {gid: name for name, gid in self.publishers(topic)}.get(sender, "UNKNOWN")
+            return "a node without a name yet" if "UNKNOWN" in name else f"node {name}"
 
         return Gathered(topic, wanted, called)
 
@@ -277,6 +294,15 @@ def sender_of(info: Any) -> Any:
     return (info.get("publisher_gid") or {}).get("data")
 
 
+@contextlib.contextmanager
+def _told(topic: str) -> Iterator[None]:
+    """What rclpy says of a topic's name or type is a BusError."""
+    try:
+        yield
+    except Exception as error:
+        raise BusError(topic, str(error).partition("\n")[0]) from error
+
+
 class RosPose:
     """The object's pose from a topic of geometry_msgs/PoseStamped; a source for :class:`WithPose`.
 
@@ -289,7 +315,8 @@ class RosPose:
     def __init__(self, plant: Ros2Plant, topic: str, frame: str) -> None:
         self._plant, self._topic, self._frame, self._other = plant, topic, frame, ""
         self._poses, self._began = plant.gathered(topic, _POSE), time.monotonic()
-        plant.subscribe(require("geometry_msgs.msg").PoseStamped, topic, self._take)
+        self._kind = require("geometry_msgs.msg").PoseStamped
+        plant.subscribe(self._kind, topic, self._take)
 
     def _take(self, message: Any, info: Any) -> None:
         there = message.header.frame_id
@@ -312,8 +339,9 @@ class RosPose:
             raise BusError(self._topic, problem)
         newest = [one for one in self._poses.newest("pose", _POSE, time.monotonic()) if one is not None]
         if not newest:
-            if time.monotonic() - self._began > _DISCOVERED and not self._plant.publishers(self._topic):
-                raise BusError(self._topic, "no node publishes it: is the camera's node running?")
+            waited = time.monotonic() - self._began > _DISCOVERED
+            if waited and (problem := self._plant.lacks(self._topic, self._kind)):
+                raise BusError(self._topic, problem)
             return None
         numbers = [one.number for one in newest]
         if not abs(sum(x**2 for x in numbers[3:]) - 1) < 1e-3:

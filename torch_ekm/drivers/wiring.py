@@ -19,7 +19,9 @@ _CHANNEL = ("name", "id", "sign", "zero", "per_rad")
 _MOTOR = (*_CHANNEL, "range", "range_deg")
 _FINGERTIP = ("name", "id", "count", "zero", "per_newton")
 _ANGLES = ("increment", "rate", "still")  # of the limits
-_MOST = {"increment": math.pi, "rate": 30.0, "still": 0.1}  # [rad, rad/s]; more was meant in deg
+_MOST = {  # [rad, rad/s], [s]; more was meant in deg, or in ms
+    "increment": math.pi, "rate": 30.0, "still": 0.1, "still_for": 10.0, "timeout": 200.0, "period": 2.0,
+}  # fmt: skip
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([\w.-]+)\s*\]")
 _KEY = re.compile(r"""^\s*["']?([\w-]+)["']?\s*=""")
 _QUOTED = re.compile(r"'([\w-]+)'")
@@ -195,9 +197,9 @@ class Wiring:
         figures = {key: read[key](key, default) for key, default in known.items()}
         for key, most in _MOST.items():
             if figures[key] > most:
-                rad = "rad/s" if key == "rate" else "rad"
-                problem = f"'{key}' must be at most {most:.3g} {rad}, got {figures[key]:.4g}"
-                raise given.error(f"{problem}; '{key}_deg' is in deg")
+                unit = "rad/s" if key == "rate" else "rad" if key in _ANGLES else "s"
+                problem = f"'{key}' must be at most {most:.3g} {unit}, got {figures[key]:.4g}"
+                raise given.error(problem + (f"; '{key}_deg' is in deg" if key in _ANGLES else ""))
         try:
             limits = Limits(**figures)
         except ParameterError as error:
@@ -242,8 +244,7 @@ def _channel(
     if name not in names:
         raise table.error(f"'name': the description has no '{name}'; it has: {', '.join(names)}")
     table.place += f" '{name}'"
-    if not named and "id" not in table.data:
-        raise table.error("the key 'id' is missing")
+    place = None if named and not isinstance(table.data.get("id"), int) else table.whole("id")
     sign = table.number("sign", 1)
     if sign not in (1, -1):
         raise table.error(f"'sign' must be 1 or -1, got {sign:g}")
@@ -254,7 +255,7 @@ def _channel(
         unit = own.unit if "per_rad" in table.data else 1.0  # the file counts as the description's does
     return Channel(
         name=name,
-        id=table.text("id", name) if named else table.whole("id", 0),
+        id=table.text("id", name) if place is None else str(place) if named else place,
         sign=int(sign),
         zero=table.number("zero", 0.0),
         per_unit=unit
@@ -299,7 +300,7 @@ def _lines(text: str) -> dict[str, dict[str, int]]:
     found: dict[str, dict[str, int]] = {}
     count: dict[str, int] = {}
     table = found.setdefault("", {})
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):
         if (head := _HEADER.match(line)) is not None:
             name = head[2]
             if head[1] == "[[":

@@ -68,16 +68,16 @@ def write_zeros(wiring: Wiring, found: list[Taut]) -> None:
         DescriptionError: a motor's table is not found in it.
         OutputError: it cannot be written.
     """
-    lines = toml_text(wiring.path, "wiring file").splitlines()
+    lines = toml_text(wiring.path, "wiring file").split("\n")  # only these end a line of TOML
     for number, one in sorted(
         ((wiring.line("motors", one.motor, "zero"), one) for one in found), reverse=True
     ):
         if not number:
             raise DescriptionError(wiring.path, f"no [[motors]] table of '{one.motor}': write its zero there")
-        text, old = f"zero = {one.zero:.6g}", re.compile(r"^(\s*)zero\s*=\s*[^#\s]+")
+        text, old = f"zero = {one.zero:.6g}", re.compile(r"""^(\s*)["']?zero["']?\s*=\s*[^#\s]+""")
         line = lines[number - 1]
         lines[number - 1 : number] = [old.sub(rf"\1{text}", line)] if old.match(line) else [line, text]
-    write_whole(wiring.path, "\n".join(lines) + "\n")
+    write_whole(wiring.path, "\n".join(lines))
 
 
 def _close(driver: HandDriver, i: int, on_step: Callable[[str], object]) -> tuple[float, float]:

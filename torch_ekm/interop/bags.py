@@ -22,9 +22,9 @@ AnyReader, _typesys = require("rosbags.highlevel").AnyReader, require("rosbags.t
 
 _MOST = 64  # numbers of one field; more is an image or a cloud
 _LABELS = ("name", "joint_names", "interface_names")  # of a message, for the entries of its arrays
-_LEFT_OUT = ("header", "layout")  # stamps and array shapes
+_LEFT_OUT = ("header", "layout", "structure_needs_at_least_one_member")  # stamps, array shapes
 _HELD = 10  # mean intervals of a column that a value stands for; later the sensor is silent
-_BACK = 0.1  # [s] a clock that falls by more was set back
+_BACK, _STEPS = 0.1, 5  # [s], and in middle intervals: where stamps fall by more, a clock was set back
 _EARLY, _LATE = -0.02, 1.0  # [s] from header.stamp to the log's time, where both are one clock's
 
 
@@ -52,7 +52,7 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
     runs with the log's clock, at most 1 s before it; else from when it was logged. A value is NaN before its
     first message, where its array has got shorter, and once it is older than ten mean intervals of its
     column; one of a latched topic (transient local) holds until the next. Texts, headers and fields of more
-    than 64 numbers are left out.
+    than 64 numbers are left out, and topics that cannot be read, unless they are asked for.
 
     Args:
         path: a folder of rosbag2, a single ``.mcap`` or ``.db3`` file, or a ``.bag`` of ROS 1.
@@ -61,12 +61,15 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
 
     Raises:
         MissingExtraError: ``rosbags`` is not installed.
-        DescriptionError: there is no such recording, it cannot be read, or ``clock`` has no message.
+        DescriptionError: there is no such recording, it or a topic that is asked for cannot be read, or
+            ``clock`` has no message.
         UnknownNameError: there is no such topic; the message lists them.
     """
     path = Path(path)
     check_bag(path)
     heard: dict[str, _Topic] = {}
+    left: dict[str, str] = {}
+    """Topics that are left out, and why."""
     try:
         reader = AnyReader([path], default_typestore=_typesys.get_typestore(_typesys.Stores.LATEST))
         with reader:
@@ -77,17 +80,27 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
             wanted = {clock, *(topics or there)}
             latched = {connection.topic for connection in reader.connections if _latched(connection.ext)}
             for place, (topic, kind, logged, raw) in enumerate(_written(reader, wanted)):
+                if topic in left:
+                    continue
                 one = heard.setdefault(topic, _Topic(topic, topic in latched))
-                one.take(place, logged, reader.deserialize(raw, kind))
+                try:
+                    one.take(place, logged, reader.deserialize(raw, kind))
+                except Exception as error:  # a type that nobody knows, a damaged message, a name twice
+                    left[topic] = f"{topic} ({kind}) cannot be read: {type(error).__name__}: {error}"
+                    if topic in (clock, *topics):
+                        raise DescriptionError(path, left[topic]) from error
+                    del heard[topic]
     except (UnknownNameError, DescriptionError):
         raise
     except FileNotFoundError:
-        raise DescriptionError(path, "there is no such recording") from None
+        problem = "a folder without metadata.yaml, as of a recorder that was killed: name the file in it"
+        raise DescriptionError(path, f"no recording: {problem}, or run 'ros2 bag reindex'") from None
     except Exception as error:  # a damaged recording fails in any way that its format can think of
         raise DescriptionError(path, f"this recording cannot be read: {error}") from error
     if clock not in heard:
         raise DescriptionError(path, f"the topic '{clock}' has no message, and its messages set the rows")
-    return _table(clock, heard)
+    table = _table(clock, heard)
+    return table._replace(notes=(*table.notes, *left.values()))
 
 
 @dataclass
@@ -116,19 +129,24 @@ class _Topic:
             at, values = self.columns.setdefault(name, ([], []))
             at.append(number)
             values.append(value)
+        of = tuple(f".{label}" for label in _labels(message))  # other names may take turns
         for name, (at, values) in self.columns.items():
-            if "[" in name and name not in found and not np.isnan(values[-1]):  # names may take turns
+            gone = name not in found and not np.isnan(values[-1])
+            if gone and ("[" in name or name.endswith(of)):
                 at.append(number)
                 values.append(np.nan)
 
     def fell(self) -> list[tuple[int, int]]:
-        """Places in the file between which its clock was set back: few; else two clocks take turns."""
+        """Places in the file between which its clock was set back."""
         places: list[tuple[int, int]] = []
-        for times in map(np.array, (self.logged, self.stamp)):
-            stays = np.append(times[2:] < times[:-2], False)[: len(times) - 1]  # else one message was late
-            fallen = np.flatnonzero((np.diff(times) < -1e9 * _BACK) & stays)
-            if len(fallen) <= max(1, len(times) // 20):
-                places += [(self.place[k], self.place[k + 1]) for k in fallen]
+        for times, least in ((np.array(self.logged), 0.0), (np.array(self.stamp), 1e9 * _BACK)):
+            step, lower = np.diff(times), np.pad(times[2:] < times[:-2], 1)
+            stays = lower[:-1] & lower[1:]  # else one message was early or late
+            back = min(least, _STEPS * np.median(np.abs(step))) if len(step) else 0.0
+            fallen = np.flatnonzero((step < -back) & stays[: len(step)])
+            if len(fallen) > max(1, len(times) // 20):  # clocks that take turns rise as they fall
+                fallen = fallen[2 * np.maximum.reduceat(step, fallen) < -step[fallen]]
+            places += [(self.place[k], self.place[k + 1]) for k in fallen]
         return places
 
     def measured(self, begin: int) -> tuple[Array, str]:
@@ -249,6 +267,15 @@ def _by_place(bag: Any, wanted: list[Any]) -> list[tuple[Any, int, bytes]]:
     return [message for _, message in sorted(pairs, key=lambda one: (one[0].chunk_pos, one[0].offset))]
 
 
+def _labels(message: Any) -> list[str]:
+    """Names that a message has for the entries of its arrays."""
+    for key in _LABELS:
+        given = getattr(message, key, None)
+        if isinstance(given, list) and given and all(isinstance(one, str) for one in given):
+            return given
+    return []
+
+
 def _numbers(value: Any, place: str, labels: Sequence[str] = ()) -> Iterator[tuple[str, float]]:
     """The numbers of a message, by name; names that it has stand for indices, also in what it contains.
 
@@ -256,10 +283,7 @@ def _numbers(value: Any, place: str, labels: Sequence[str] = ()) -> Iterator[tup
         DescriptionError: a name stands in it twice.
     """
     if is_dataclass(value):
-        for key in _LABELS:
-            given = getattr(value, key, None)
-            if isinstance(given, list) and given and all(isinstance(one, str) for one in given):
-                labels = given
+        labels = _labels(value) or labels
         if twice := [one for one in dict.fromkeys(labels) if labels.count(one) > 1]:
             raise DescriptionError(place, f"a message has the name '{twice[0]}' twice")
         for one in fields(value):
@@ -268,7 +292,10 @@ def _numbers(value: Any, place: str, labels: Sequence[str] = ()) -> Iterator[tup
     elif isinstance(value, bool | int | float | np.number | np.bool_):
         yield place, float(value)
     elif isinstance(value, list | np.ndarray) and len(value) <= _MOST:
-        named = len(value) == len(labels) > 0 and not isinstance(value[0], str)
-        places = [f".{label}" for label in labels] if named else [f"[{i}]" for i in range(len(value))]
+        # transforms take turns on one topic
+        frames = [getattr(one, "child_frame_id", "") for one in value if isinstance(value, list)]
+        names = frames if all(frames) and 0 < len(set(frames)) == len(value) else labels
+        named = len(value) == len(names) > 0 and not isinstance(value[0], str)
+        places = [f".{name}" for name in names] if named else [f"[{i}]" for i in range(len(value))]
         for at, one in zip(places, value, strict=True):
             yield from _numbers(one, f"{place}{at}", () if named else labels)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -27,6 +26,10 @@ _MOST_COLUMNS = 4096
 _INDEXED = re.compile(r"(.+)\[([0-9]{1,4})\]")
 _TIME = re.compile(  # also %time of ROS 1, __time of PlotJuggler, header.stamp
     r"(.*[./])?[%_]*(time|timestamp|stamp)([ _]?[\[(]?(s|ms|us|ns|sec|seconds)[\])]?)?", re.IGNORECASE
+)
+_TIME_WORD = re.compile(  # in a name, as sim_time, rosbagTimestamp, t [s]; nanosec begins anew each second
+    r"(?!.*n(ano)?sec)((.*[./])?t|(.*[^a-z])?([a-z]*time|[a-z]*stamp|secs?|seconds?|elapsed|clock))([^a-z].*)?",
+    re.IGNORECASE,
 )
 
 
@@ -89,18 +92,23 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
 def _file_rows(names: Names, read: Read, wanted: Sequence[str]) -> Rows:
     """Another run begins where a column that is called time goes back."""
     values = read(wanted)
-    part, about = np.zeros(len(values), dtype=int), ""
-    for clock in [name for name in names if _TIME.fullmatch(name)][:1]:
-        with contextlib.suppress(DescriptionError):  # dates, or with holes
-            back = np.diff(read([clock])[:, 0]) < 0
-            if 20 * back.sum() > len(back):
-                first = int(back.argmax()) + 2
-                problem = f"goes back in {back.sum()} of {len(values)} rows, first in row {first}"
-                about = f" Column '{clock}' {problem}: rows should be in the order of time."
-            elif back.any():
-                part = np.append(0, back.cumsum())
-                about = f" {part[-1] + 1} runs: column '{clock}' goes back."
-    return Rows(values, part, about)
+    starts, about = np.zeros(len(values), dtype=bool), ""
+    for clock in filter(_TIME_WORD.fullmatch, names):
+        try:
+            column = read([clock])[:, 0]
+        except DescriptionError:  # dates, or with holes
+            continue
+        step = np.diff(column, prepend=column[:1])
+        back = step < 0
+        again = np.abs(column[back] - column[:1]) <= np.median(np.abs(step)) if back.any() else back
+        if 20 * back.sum() > len(back) and not again.all():
+            if _TIME.fullmatch(clock):
+                problem = f"goes back in {back.sum()} of {len(values)} rows, first in row {back.argmax() + 1}"
+                about += f" Column '{clock}' {problem}: rows should be in the order of time."
+        elif back.any() and (again.all() or 10 * back.sum() <= (step > 0).sum()):
+            starts |= back
+            about += f" {back.sum() + 1} runs: column '{clock}' goes back."
+    return Rows(values, starts.cumsum(), about)
 
 
 def _bag_rows(path: Path, bag: interop.BagTable, wanted: Sequence[str]) -> Rows:
