@@ -148,8 +148,8 @@ def test_a_fleet_that_detects_changes_with_a_memory_is_so_many_single_models():
 
 
 def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
-    x, y = stream(61, 2, 3)  # a block ends there
-    mask = torch.rand(61, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
+    x, y = stream(63, 2, 3)  # a block ends there
+    mask = torch.rand(63, 2, 3, generator=torch.Generator().manual_seed(1)) < 0.7
     fleet = sogp(3, 2, capacity=12, batch_shape=(2, 3), parts=[Standardize()])
     fleet.update(x, y, mask)
     units = fleet.units

@@ -67,29 +67,13 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
     """
     path = Path(path)
     check_bag(path)
-    heard: dict[str, _Topic] = {}
-    left: dict[str, str] = {}
-    """Topics that are left out, and why."""
     try:
-        reader = AnyReader([path], default_typestore=_typesys.get_typestore(_typesys.Stores.LATEST))
-        with reader:
+        with AnyReader([path], default_typestore=_typesys.get_typestore(_typesys.Stores.LATEST)) as reader:
             there = sorted({connection.topic for connection in reader.connections})
             for topic in (clock, *topics):
                 if topic not in there:
                     raise UnknownNameError("topic", topic, there)
-            wanted = {clock, *(topics or there)}
-            latched = {connection.topic for connection in reader.connections if _latched(connection.ext)}
-            for place, (topic, kind, logged, raw) in enumerate(_written(reader, wanted)):
-                if topic in left:
-                    continue
-                one = heard.setdefault(topic, _Topic(topic, topic in latched))
-                try:
-                    one.take(place, logged, reader.deserialize(raw, kind))
-                except Exception as error:  # a type that nobody knows, a damaged message, a name twice
-                    left[topic] = f"{topic} ({kind}) cannot be read: {type(error).__name__}: {error}"
-                    if topic in (clock, *topics):
-                        raise DescriptionError(path, left[topic]) from error
-                    del heard[topic]
+            heard, left = _heard(reader, {clock, *(topics or there)})
     except (UnknownNameError, DescriptionError):
         raise
     except FileNotFoundError:
@@ -97,10 +81,30 @@ def read_bag(path: str | Path, clock: str, topics: Sequence[str] = ()) -> BagTab
         raise DescriptionError(path, f"no recording: {problem}, or run 'ros2 bag reindex'") from None
     except Exception as error:  # a damaged recording fails in any way that its format can think of
         raise DescriptionError(path, f"this recording cannot be read: {error}") from error
+    for topic in (clock, *topics):
+        if topic in left:
+            raise DescriptionError(path, left[topic])
     if clock not in heard:
         raise DescriptionError(path, f"the topic '{clock}' has no message, and its messages set the rows")
     table = _table(clock, heard)
     return table._replace(notes=(*table.notes, *left.values()))
+
+
+def _heard(reader: Any, wanted: set[str]) -> tuple[dict[str, _Topic], dict[str, str]]:
+    """Topics, and why others cannot be read."""
+    latched = {connection.topic for connection in reader.connections if _latched(connection.ext)}
+    heard: dict[str, _Topic] = {}
+    left: dict[str, str] = {}
+    for place, (topic, kind, logged, raw) in enumerate(_written(reader, wanted)):
+        if topic in left:
+            continue
+        one = heard.setdefault(topic, _Topic(topic, topic in latched))
+        try:
+            one.take(place, logged, reader.deserialize(raw, kind))
+        except Exception as error:  # a type that nobody knows, a damaged message, a name twice
+            left[topic] = f"{topic} ({kind}) cannot be read: {type(error).__name__}: {error}"
+            del heard[topic]
+    return heard, left
 
 
 @dataclass
