@@ -171,7 +171,7 @@ def of_motions(turns: Sequence[float]) -> dict[str, list[float]]:
         for step in loop.steps(target):
             times["motion"].append(time.perf_counter() - begin - (plant.seconds - before))
             times["decision and learning"].append(step.seconds)
-            times["linearize"].append(timed(lambda s=step: model.linearize(s.after.state)))
+            times["linearize"].append(timed(lambda: model.linearize(seen.state)))
             begin, before = time.perf_counter(), plant.seconds
     plant.close()
     return times
