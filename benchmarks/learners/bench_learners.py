@@ -320,7 +320,8 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
     for measure in (against_c, of_fleets, of_peers):
-        print(Report("", "", [measure()]).markdown(level=2), flush=True)
+        if (found := measure()).rows:
+            print(Report("", "", [found]).markdown(level=2), flush=True)
 
 
 if __name__ == "__main__":
