@@ -140,6 +140,7 @@ class Question(Protocol):
         # the tables have the others
         first = turns if self.told else turns[turns[self.by].isin(turns[self.by].head(1))]
         before = select(trials).drop(select(trials, kind="turn").index)
+        before = before[before[self.by].isin(first[self.by])]
         lost = f" Of {len(before)} turns before these {int(before['lost'].sum())} lost the object."
         return Report(self.title, f"{self.answer(first)}.{lost if len(before) else ''}", tables, [figure])
 
