@@ -129,9 +129,9 @@ class Question(Protocol):
 
     def report(self, seeds: Sequence[int], trials: Frame, folder: Path) -> Report:
         """Tables, picture and verdict of the trials with a grasp."""
-        turns = self.counted(trials)
+        turns, grasped = self.counted(trials), select(trials)
         tables = [table(turns, self.by, self.columns, self.name, self.title)] if self.columns else []
-        tables += [one for make in self.more if (one := make(select(trials))).rows]
+        tables += [one for make in self.more if (one := make(grasped)).rows]
         if turns[self.split].nunique() > 1 and self.split != self.by:
             tables.append(ends_table(turns, self.by, self.split))
         drawn = ends_picture(turns, self.by, self.split) if self.picture is None else self.picture(turns)
@@ -139,8 +139,7 @@ class Question(Protocol):
         figure = save_figure(drawn, folder, self.name, of)
         # the tables have the others
         first = turns if self.told else turns[turns[self.by].isin(turns[self.by].head(1))]
-        before = select(trials).drop(select(trials, kind="turn").index)
-        before = before[before[self.by].isin(first[self.by])]
+        before = grasped[(grasped["kind"] != "turn") & grasped[self.by].isin(first[self.by])]
         lost = f" Of {len(before)} turns before these {int(before['lost'].sum())} lost the object."
         return Report(self.title, f"{self.answer(first)}.{lost if len(before) else ''}", tables, [figure])
 

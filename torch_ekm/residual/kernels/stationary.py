@@ -12,18 +12,21 @@ from ..._checks import check_count
 from ...typing import Float, Tensor
 from .kernel import Kernel, log_parameter
 
+LARGE = 1e7  # square whose rounding, 1e-9, is a distance between points that nearly coincide
+
 
 def squared_distances(x: Float[Tensor, "*any n d"], z: Float[Tensor, "*batch m d"]) -> Tensor:
     """``|x_i - z_j|^2``, ``(*batch, n, m)``."""
-    # differences are exact, as a basis needs it, one point of which may lie at 1e11; products are faster for
-    # many queries, and need less memory on a GPU
-    if x.shape[-2] == 1 or (x is z and not x.is_cuda):
-        return (z.unsqueeze(-3) - x.unsqueeze(-2)).square().sum(-1)
+    if x.shape[-2] == 1:  # differences are exact; products are faster for many queries
+        return (z - x).square().sum(-1).unsqueeze(-2)
     # about one of the points: far from 0 the difference of large squares would be all rounding
     centre = z[..., :1, :].detach()
-    x, z = x - centre, z - centre
-    d2 = x.square().sum(-1).unsqueeze(-1) + z.square().sum(-1).unsqueeze(-2)
-    return (d2 - 2.0 * x @ z.mT).clamp_min(0.0)
+    a, c = x - centre, z - centre
+    a2, c2 = a.square().sum(-1), c.square().sum(-1)
+    # a basis with a point far out needs differences; on a GPU looking would mean waiting
+    if x is z and not (x.is_cuda or torch.compiler.is_compiling()) and bool((c2 > LARGE).any()):
+        return (z.unsqueeze(-3) - x.unsqueeze(-2)).square().sum(-1)
+    return (a2.unsqueeze(-1) + c2.unsqueeze(-2) - 2.0 * a @ c.mT).clamp_min(0.0)
 
 
 class StationaryKernel(Kernel):

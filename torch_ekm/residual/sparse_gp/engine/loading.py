@@ -16,18 +16,10 @@ from ....exceptions import SpeedWarning
 
 _LAST = "torch_ekm.residual.numba_mixture"  #: of the modules of loops, which imports the others
 _LAST_LOOP = "mix_fleet"  #: of that module: what is compiled last
-_SOURCES = (
-    "**/numba_*.py",
-    "**/*plan.py",
-    "sparse_gp/monitor.py",
-    "sparse_gp/hyperparameters.py",
-    "**/recursion.py",
-    "running_scale.py",
-    "experts.py",
-    "local_noise.py",
-    "tails.py",
-    "misled.py",
-)
+_SOURCES = (  # what loops are made of, with the figures that stand in them
+    "**/numba_*.py", "**/*plan.py", "sparse_gp/monitor.py", "sparse_gp/hyperparameters.py", "**/recursion.py",
+    "kernels/stationary.py", "running_scale.py", "experts.py", "local_noise.py", "tails.py", "misled.py",
+)  # fmt: skip
 _OFF = (
     "compiled loops are off, so learners take longer: {}; if numba cannot write its cache, set "
     "NUMBA_CACHE_DIR to a folder that can be written"

@@ -16,6 +16,7 @@ import math
 import numpy as np
 from numba import types
 
+from ...kernels.stationary import LARGE
 from .. import plan as P
 from .numba_math import add_products, dot, exp, transposed
 from .numba_memory import A1, A2, I1, INT, F, inner, integers_at, matrix_at
@@ -24,7 +25,6 @@ from .numba_memory import vector_at as at
 #: what a kernel's ``kind`` means
 SQUARED_EXPONENTIAL, MATERN32 = 0, 1
 _FAR = 1e10  # squared scaled distance beyond which a kernel is 0
-_LARGE = 1e7  # square whose rounding, 1e-9, is a distance between points that nearly coincide
 
 
 @inner(types.void(I1, INT, A2))
@@ -193,7 +193,7 @@ def kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal):
                 to[i, j] = of[i, j] - basis[0, j]
             squares[i] = dot(to[i], to[i], n_s)
             far = max(far, squares[i])
-    if far > _LARGE:  # that one, or others, lie far out: differences are exact
+    if far > LARGE:  # that one, or others, lie far out: differences are exact
         for i in range(N):
             diagonal[i] = kernel_row(p, own, q[i], basis, active, k[i], psi[i], phi[i])
         return
