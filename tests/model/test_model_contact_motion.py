@@ -225,6 +225,23 @@ def test_a_motion_that_lets_go_is_followed_and_does_not_leap(held) -> None:
     assert whole.state.minus(parts.state).norm() < 0.02 * whole.state.minus(start.state).norm()
 
 
+def test_where_a_finger_slides_the_object_does_not_leap_to_another_equilibrium() -> None:
+    """One program has two answers: the near one, and one with the object turned by 17 deg and more."""
+    plant = SimulatedHand("icub_right", "flashlight", preset="none")
+    seen = plant.reset(0).truth
+    plant.close()
+    model, force = (
+        KinematicModel(plant.hand, dataclasses.replace(plant.object, friction=0.5)),
+        seen.fingertip_force,
+    )
+    contacts = model.touching(seen.state, force)
+    start = model.linearize(seen.state, contacts, fingertip_force=force, on_unstable="flag")
+    for w in 0.03 * torch.randn(12, model.hand.n_a, generator=torch.Generator().manual_seed(0), dtype=F64):
+        w[0] = w[-1] = 0.0
+        step = ContactMotion(model, start).move(w)
+        assert step.increment[-3:].norm() < 8 * DEG
+
+
 def test_forces_answer_by_the_figures_that_are_known(held, exact) -> None:
     """Moment arms of the fingers a third larger, half the thumb's: against differences of motions."""
     model, start, _, _ = held

@@ -36,6 +36,7 @@ _DAMPING = 0.5  # [N m/rad] of a fall to the next equilibrium
 _FALLS = 60  # steps of a fall
 _CALM = 1e-3  # [rad] a step of a fall this small has come to rest
 _FARTHEST = 0.3  # [rad] of a substep, beyond which Newton's method has left for elsewhere, and of a fall
+_LEAP = 0.1  # [rad] of the object in a substep: friction allows several equilibria, and this is another
 
 
 class ContactMode(Enum):
@@ -278,7 +279,7 @@ class ContactMotion:
         way = Way(here, self.loads.pull, da, total)
         for correction in range(_CORRECTIONS):
             done = self._solve(here, loads, way)
-            if done is None or self._farthest(way.total + done.answer.z) > _FARTHEST:
+            if done is None or self._leaps(way.total + done.answer.z):
                 return None
             size, doing = float(np.abs(done.answer.z).max()), done.doing
             if correction and (size < _SAME or (size < _FINE and doing == was)):
@@ -333,6 +334,10 @@ class ContactMotion:
         joints = self._laws.joints
         n_y = joints.shape[1]
         return max(float(np.abs(joints @ z[:n_y]).max()), float(np.abs(z[n_y:]).max()))
+
+    def _leaps(self, z: Array) -> bool:
+        """An increment of a substep leads to another equilibrium than the motion."""
+        return self._farthest(z) > _FARTHEST or float(np.abs(z[-6:]).max()) > _LEAP
 
     def _report(
         self, before: GraspState, names: tuple[str, ...], last: _Substep, slid: dict[str, float]
