@@ -39,7 +39,7 @@ from torch_ekm.control import (
     PoseTarget,
     Safety,
 )
-from torch_ekm.control.safety.readings import Effect, ReadingTests
+from torch_ekm.control.guards import Effect, ReadingTests
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel

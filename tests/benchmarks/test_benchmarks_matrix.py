@@ -24,7 +24,7 @@ from matrix import FIGURES, bands_table, ends_table, verdict
 from questions import QUESTIONS
 from sessions import TARGETS, Part, target_of
 
-from torch_ekm.control.safety.on_the_way import OnTheWay
+from torch_ekm.control.watch import OnTheWay
 from torch_ekm.experiments import runner
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord

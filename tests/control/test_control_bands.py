@@ -11,8 +11,8 @@ import torch
 from obedient_plant import Obedient
 
 from torch_ekm.control import Bands, ClosedLoop, HandFigures, HandKnowledge, LookAndMoveController, PoseTarget
-from torch_ekm.control.bands import lets_go, servo_std
 from torch_ekm.control.knowledge import STEADY, ModelError
+from torch_ekm.control.rehearsal import lets_go, servo_std
 from torch_ekm.enhanced import EnhancedModel
 
 DEG = math.pi / 180
@@ -90,7 +90,7 @@ def test_only_servos_of_a_stiff_hand_let_a_finger_go(held, path, monkeypatch) ->
     opens = piece.force.clone()
     opens[pads] = 0.0
     assert not lets_go(hand, dataclasses.replace(piece, force=opens))  # the next look finds it
-    monkeypatch.setattr("torch_ekm.control.bands.servo_std", lambda *_: 20 * errs)
+    monkeypatch.setattr("torch_ekm.control.rehearsal.servo_std", lambda *_: 20 * errs)
     for share, loose in ((2.1, False), (1.9, True)):
         force = piece.force.clone()
         force[pads] = share * 20 * errs

@@ -21,7 +21,7 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
-from torch_ekm.control.qp import ControlProblem
+from torch_ekm.control.program import ControlProblem
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError, ParameterError, SolverError

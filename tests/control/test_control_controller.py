@@ -28,7 +28,7 @@ from torch_ekm.control import (
     Squares,
     StopReason,
 )
-from torch_ekm.control.qp import build_qp
+from torch_ekm.control.program import build_qp
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState

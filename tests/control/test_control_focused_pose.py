@@ -20,7 +20,7 @@ from torch_ekm.control import (
     StoppingRule,
     StopReason,
 )
-from torch_ekm.control.reach import out_of_reach
+from torch_ekm.control.ends import out_of_reach
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState

@@ -19,7 +19,7 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
-from torch_ekm.control.safety.readings import ReadingTests
+from torch_ekm.control.guards import ReadingTests
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper, Stamps

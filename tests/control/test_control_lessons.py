@@ -18,7 +18,7 @@ from torch_ekm.control import (
     LookAndMoveController,
     PoseTarget,
 )
-from torch_ekm.control.lessons import Lessons
+from torch_ekm.control.knowledge import Lessons
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.model import KinematicModel
 
@@ -162,7 +162,7 @@ def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
             LookAndMoveController(EnhancedModel.for_grasp(told, seen.state), axis),
             HandKnowledge.of(model.hand),
         )
-        controller.follow(known)
+        controller.follow(known.figures, known.forces)
         lessons = Lessons(controller, known, known.figures if learns else DescribedFigures())
         lessons.touch(seen, lambda _: 0.0)  # joints that are off explain it better
         assert controller.kinematic.surface == 0.0

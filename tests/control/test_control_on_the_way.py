@@ -20,7 +20,7 @@ from torch_ekm.control import (
     PoseTarget,
     StopReason,
 )
-from torch_ekm.control.safety.on_the_way import OnTheWay
+from torch_ekm.control.watch import OnTheWay
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation, PlantStatus, Stamps
 

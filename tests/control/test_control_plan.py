@@ -27,8 +27,8 @@ from torch_ekm.control import (
     StopReason,
     WholeTurn,
 )
+from torch_ekm.control.program import LinearizedModel
 from torch_ekm.control.rehearsal import Rehearsal
-from torch_ekm.control.situation import LinearizedModel
 from torch_ekm.description import load_object
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import StateError

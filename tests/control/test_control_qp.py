@@ -13,7 +13,7 @@ from torch_ekm.control import (
     Inequality,
     Squares,
 )
-from torch_ekm.control.qp import ControlSolution, build_qp
+from torch_ekm.control.program import ControlSolution, build_qp
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 
 DEG = math.pi / 180

@@ -20,7 +20,7 @@ from torch_ekm.control import (
     StoppingRule,
 )
 from torch_ekm.control import StopReason as Reason
-from torch_ekm.control.safety.watch import Watch
+from torch_ekm.control.watch import Watch
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.plant import Observation
 

@@ -4,32 +4,33 @@ from __future__ import annotations
 
 from ..estimation.force_sensitivity import ForceSensitivity
 from ..estimation.hand_figures import DescribedFigures, HandFigures
-from .bands import Bands
 from .closed_loop import ClosedLoop
 from .controller import LookAndMoveController
-from .decision import Band, Decision, Piece, StopReason, Waypoint
+from .decision import Band, Decision, Manipulation, Piece, Step, Stop, StopReason, Waypoint
 from .ends import Safety, StoppingRule
 from .focus import Direction, FocusedPose, PoseTarget
+from .guards import Guards
 from .journal import Journal
 from .knowledge import HandKnowledge
-from .limits import (
+from .model_hand import ModelHand
+from .plan import OneStep, Plan, Planner, Reach, WholeTurn
+from .program import Bounds, Equality, Inequality, LinearizedModel, Situation, Squares
+from .rehearsal import Bands, End, PathEnd
+from .tasks import (
     DEFAULT_LIMITS,
+    DEFAULT_TASKS,
     ActuatorLimit,
+    EffortTask,
+    FocusTask,
+    GripForceTask,
     JointLimit,
     Limit,
     LimitingFunction,
     NormalForceLimit,
+    OffAxisTask,
     StepBound,
+    Task,
 )
-from .manipulation import Manipulation, Step, Stop
-from .model_hand import ModelHand
-from .plan import OneStep, Plan, Planner, WholeTurn
-from .qp import Bounds, Equality, Inequality, Squares
-from .reach import Reach
-from .rehearsal import End, PathEnd
-from .safety import Guards
-from .situation import LinearizedModel, Situation
-from .tasks import DEFAULT_TASKS, EffortTask, FocusTask, GripForceTask, OffAxisTask, Task
 
 __all__ = [
     "DEFAULT_LIMITS",

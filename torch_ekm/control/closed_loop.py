@@ -20,17 +20,13 @@ from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
 from ..residual.sparse_gp.engine.loading import load_loops
 from ..typing import Tensor
 from .controller import LookAndMoveController
-from .decision import Decision, Expectation, StopReason
+from .decision import Decision, Expectation, Manipulation, Step, Stop, StopReason
 from .ends import Ends, Safety, failed
 from .focus import PoseTarget
-from .knowledge import HandKnowledge
-from .lessons import Lessons
-from .manipulation import Manipulation, Step, Stop
-from .plan import OneStep, Plan, Planner, WholeTurn
-from .reach import Reach, reach
-from .safety.guards import Objection, gravest
-from .safety.on_the_way import OnTheWay
-from .safety.watch import Watch
+from .guards import Objection, gravest
+from .knowledge import HandKnowledge, Lessons
+from .plan import OneStep, Plan, Planner, Reach, WholeTurn, reach
+from .watch import OnTheWay, Watch
 
 # of the wanted grip, with which is turned after so many movements that only grip; then no finger is weak
 _FIRM = 0.75, 0.75, 1e-6, 1e-6
@@ -86,7 +82,7 @@ class ClosedLoop:
             if isinstance(followed := controller.kinematic.figures, HandFigures | DescribedFigures):
                 knowledge.figures = followed
         knowledge.check(hand)
-        controller.follow(knowledge)
+        controller.follow(knowledge.figures, knowledge.forces)
         self._figures = DescribedFigures() if controller.enhanced is None else knowledge.figures
         self.controller, self.learn, self.decline = controller, learn, decline
         self.planner = planner or (OneStep() if controller.enhanced is None else WholeTurn())

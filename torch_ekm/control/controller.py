@@ -19,15 +19,13 @@ from ..model import ContactMotion, KinematicModel, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, Piece, StopReason, made_of, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
-from .limits import DEFAULT_LIMITS, Limit, LimitingFunction, StepBound, contact_travel
-from .qp import DEGREE, ControlProblem, ControlSolution, as_array, build_qp
-from .situation import LinearizedModel, Situation
-from .tasks import DEFAULT_TASKS, Task
+from .program import DEGREE, ControlProblem, ControlSolution, LinearizedModel, Situation, as_array, build_qp
+from .tasks import DEFAULT_LIMITS, DEFAULT_TASKS, Limit, LimitingFunction, StepBound, Task, contact_travel
 
 if TYPE_CHECKING:
     from ..estimation.force_sensitivity import ForceSensitivity
+    from ..estimation.hand_figures import DescribedFigures, HandFigures
     from ..model import Linearization
-    from .knowledge import HandKnowledge
 
 _BOUND = StepBound()
 _LIST = "a list of objects with a method rows(model, seen)"
@@ -98,13 +96,13 @@ class LookAndMoveController:
         self.previous: tuple[Linearization, Tensor] | None = None
         """The last linearization of this grasp whose forces were found, and the encoders there."""
 
-    def follow(self, knowledge: HandKnowledge) -> None:
+    def follow(self, figures: HandFigures | DescribedFigures, forces: ForceSensitivity) -> None:
         """Let f of the enhanced model follow the figures of the hand and its forces as they are learned."""
         if self.enhanced is None:
             return
-        self.forces = knowledge.forces
-        if self.kinematic.figures is not knowledge.figures:
-            self.kinematic = self.enhanced.model = self.kinematic.with_figures(knowledge.figures)
+        self.forces = forces
+        if self.kinematic.figures is not figures:
+            self.kinematic = self.enhanced.model = self.kinematic.with_figures(figures)
 
     def reset(self, tighter: float = 0.0) -> None:
         """Forget the contact forces of the last grasp, and grip tighter than suits the object [N]; a

@@ -7,21 +7,24 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+import torch
+
 from .._checks import check_kind
 from .._noise import DEGREE
-from ..exceptions import CommandRefusedError, ParameterError
+from ..exceptions import CommandRefusedError, GraspError, ParameterError
 from ..plant import Observation, PlantStatus
 from ..plant.frames_at_rest import mean_reading
-from .decision import StopReason
+from .decision import Stop, StopReason
 from .focus import A_TARGET, PoseTarget
-from .manipulation import Stop
-from .reach import out_of_reach
-from .safety.guards import Guards
+from .guards import Guards
+from .tasks import ActuatorLimit
 
 if TYPE_CHECKING:
     from .controller import LookAndMoveController
-    from .safety.watch import Watch
+    from .watch import Watch
 
+_WEAK = 0.035  # of the largest gain: a direction that motors do not hold; those that they hold have .07
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
 
 
@@ -160,3 +163,36 @@ def failed(error: BaseException, final: Observation) -> Stop:
     refused = isinstance(error, CommandRefusedError)
     reason = StopReason.COMMAND_REFUSED if refused else StopReason.PLANT_FAILED
     return Stop(reason, final, f"{type(error).__name__}: {error}", error)
+
+
+@torch.no_grad()
+def out_of_reach(controller: LookAndMoveController, seen: Observation, target: PoseTarget) -> str:
+    """Why motors cannot bring an object to a target; empty: they can, as far as J_m says.
+
+    Two tests, of first order: the motors hold each direction of the focus, by the singular values of
+    ``M_c D E_p J_m`` with D that counts 0.8 mm as 1 deg; and their whole ranges come as far as the target.
+    """
+    focus, hand = controller.focus, controller.kinematic.hand
+    try:
+        lin = controller.kinematic.linearize(seen.state, fingertip_force=seen.fingertip_force)
+    except GraspError:  # the loop will say so itself
+        return ""
+    D = torch.tensor([1250 * DEGREE] * 3 + [1.0] * 3, dtype=torch.float64)
+    asked = focus.matrix @ (D * target.error(seen.state))
+    limits = (limit for limit in controller.limits if isinstance(limit, ActuatorLimit))
+    moves = next(limits, ActuatorLimit()).moves(hand)
+    scaled = (D[:, None] * lin.object_jacobian)[:, torch.from_numpy(moves)]
+    U, found, _ = torch.linalg.svd(focus.matrix @ scaled)
+    gains = torch.cat([found, found.new_zeros(len(asked) - len(found))])
+    held = gains >= _WEAK * torch.linalg.matrix_norm(scaled, 2)
+    if not (focus.is_turn or bool(held.all())):
+        parts = sorted(zip(U[:, -1].abs().tolist(), map(str, focus.directions), strict=True), reverse=True)
+        weak = " with ".join(name for share, name in parts if share > 0.3)
+        few = f"the motors hold {int(held.sum())} of the {len(gains)} directions of the focus"
+        return f"{few}, and too little of {weak}: leave a direction out"
+    room = torch.from_numpy((hand.actuator_upper - hand.actuator_lower)[np.flatnonzero(moves)])
+    share = float((asked @ focus.matrix @ scaled).abs() @ room / (asked @ asked).clamp(min=1e-9))
+    if bool(held.all()) and share >= 1:  # the path of a turn about one axis says more
+        return ""
+    most = f"to first order the whole ranges of the motors come {100 * min(share, 1):.0f} % of the way"
+    return f"{most}: choose a nearer target, or another direction"

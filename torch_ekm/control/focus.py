@@ -166,6 +166,11 @@ class FocusedPose:
         """
         return cls([Direction(axis, "deg")])
 
+    @property
+    def is_turn(self) -> bool:
+        """A rotation about one axis, and nothing else."""
+        return [one.unit for one in self.directions] == ["deg"]
+
     def error(self, target: PoseTarget, state: GraspState) -> float:
         """``|e| = max_i tolerance_scale_i |e_i|`` [rad], ``e = M_c`` times the twist from state to target."""
         return float((self.tolerance_scale * (self.matrix @ target.error(state))).abs().max())

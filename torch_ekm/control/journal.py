@@ -15,10 +15,10 @@ from ..exceptions import FileFormatError, ResumeError
 from ..plant import Observation, PlantStatus
 from ..residual.files import read, write
 from .closed_loop import ClosedLoop
+from .decision import Manipulation, Step, Stop
 from .focus import PoseTarget
-from .manipulation import Manipulation, Step, Stop
+from .guards import deg
 from .rehearsal import LONGEST
-from .safety.guards import deg
 
 _KIND = "turn under way"
 

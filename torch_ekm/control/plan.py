@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import torch
 
 from .._noise import DEGREE
+from ..exceptions import ParameterError
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
-from .bands import DEVIATIONS, Band, Bands, lets_go
-from .decision import Decision, StopReason, Waypoint
+from .decision import Band, Decision, StopReason, Waypoint
 from .focus import FocusedPose, PoseTarget
-from .rehearsal import LONGEST, End, PathEnd, Rehearsal, is_loose
+from .rehearsal import DEVIATIONS, LONGEST, Bands, End, PathEnd, Rehearsal, is_loose, lets_go
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -283,3 +283,39 @@ def _joined(
         grip=None if first is None else first.grip,
         band=waypoints[-1].band,
     )
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far an object can be turned about an axis, by the model."""
+
+    angle: float
+    """Largest on the way, with the sign that was asked about [rad]."""
+    end: End
+    """What ends it."""
+    safe: float
+    """To the last waypoint that is safe, see :class:`WholeTurn` [rad]."""
+    plan: Plan
+    """The path."""
+
+    def __str__(self) -> str:
+        return f"{self.angle / DEGREE:.1f} deg ({self.end})"
+
+
+@torch.no_grad()
+def reach(
+    controller: LookAndMoveController, knowledge: HandKnowledge, seen: Observation, sign: int, limit: float
+) -> Reach:
+    """See :meth:`~torch_ekm.control.ClosedLoop.reach`."""
+    if sign not in (1, -1):
+        raise ParameterError("sign", sign, "1 or -1")
+    if not 0 < limit <= 170 * DEGREE:
+        raise ParameterError("limit", limit, "above 0 and at most 170 deg [rad]")
+    if not controller.focus.is_turn:
+        raise ParameterError("focus", controller.focus.matrix.tolist(), "a rotation about one axis")
+    axis = controller.focus.matrix[0, 3:]
+    controller.kinematic.linearize(seen.state)  # raises, and says why
+    target = PoseTarget.turned(seen.state, axis, sign * limit)
+    plan = WholeTurn().plan(controller, seen, target, knowledge, 0.0, whole=True, longest=math.inf)
+    turned = [float(axis @ state.minus(seen.state)[-3:]) for state in plan.states]
+    return Reach(turned[-1], plan.end, turned[plan.safe], plan)

@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 import torch
 
-from ..control.safety import Guards
-from ..control.safety.readings import ReadingTests, stated
+from ..control.guards import Guards, ReadingTests, stated
 from ..enhanced import EnhancedModel
 from ..exceptions import ParameterError
 from ..model import KinematicModel

@@ -15,7 +15,7 @@ from ..contact import ContactSet
 from ..contact.contact_kinematics import contact_frames
 from ..contact.signed_distance import signed_distance
 from ..control import ClosedLoop, LookAndMoveController, PoseTarget
-from ..control.reach import out_of_reach
+from ..control.ends import out_of_reach
 from ..description import ContactPad, HandDescription, ObjectDescription, Shape, load_hand, load_object
 from ..exceptions import EKMError, EquilibriumError, GraspError, MissingExtraError
 from ..kinematics import ActuationMap, HandKinematics, LinkPoses
