@@ -177,5 +177,5 @@ def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
                 < float(thin.contacts(seen.state, seen.fingertip_force).gap.min())
             )
         assert told.surface == 0.0
-        lessons.begin()
+        lessons.begin(seen)
         assert followed.surface == 0.0

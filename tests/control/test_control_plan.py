@@ -101,12 +101,16 @@ def test_the_tangent_is_that_of_the_motion_in_which_a_pad_slides(held, slippery)
         assert float((J @ h - found).norm()) < 0.05 * float(found.norm())
 
 
+def rehearsal(controller: LookAndMoveController, seen, target: PoseTarget | None) -> Rehearsal:
+    return Rehearsal(controller, HandKnowledge.of(controller.kinematic.hand), seen, target, 2.5 * DEG)
+
+
 def test_a_piece_in_which_a_pad_slides_is_chosen_about_where_it_leads(held, slippery) -> None:
     seen, axis, _ = held
     tasks = [EffortTask(), OffAxisTask(translation_weight=0.05), GripForceTask(), FocusTask()]  # let it slide
     controller = LookAndMoveController(slippery, axis, tasks)
     target = PoseTarget.turned(seen.state, axis, degrees=-15)
-    path = [state for _, state in Rehearsal(controller, seen, target, 2.5 * DEG).pieces()]
+    path = [one.state for one in rehearsal(controller, seen, target).path()]
     assert len(path) <= 8
     assert controller.focus.error(target, path[-1]) < 0.1 * DEG
     assert controller.focus.off_rotation(path[-1].minus(seen.state)) < 0.2 * DEG
@@ -122,9 +126,9 @@ def test_a_grasp_that_its_forces_make_soft_is_gripped_no_harder(
     lin = model.linearize(seen.state, fingertip_force=seen.fingertip_force)
 
     def gripped() -> tuple[float, float]:
-        rehearsal = Rehearsal(controller, seen, None, 2.5 * DEG)
-        forces = [piece.force for piece, _ in rehearsal.pieces()]
-        return rehearsal.first.grip.wanted, max((float(force.max()) for force in forces), default=0.0)
+        made = rehearsal(controller, seen, None)
+        forces = [one.piece.force for one in made.path()]
+        return made.first.grip.wanted, max((float(force.max()) for force in forces), default=0.0)
 
     wanted, most = gripped()
     assert wanted == 8.0
@@ -147,7 +151,8 @@ def test_an_object_stays_in_its_place_along_the_grip_while_it_turns(held) -> Non
     """With a quarter of the weight of its place it goes by 3.2 mm."""
     seen, axis, model = held
     controller, target = LookAndMoveController(model, axis), PoseTarget.turned(seen.state, axis, degrees=-10)
-    *_, (_, end) = Rehearsal(controller, seen, target, 2.5 * DEG).pieces()
+    *_, last = rehearsal(controller, seen, target).path()
+    end = last.state
     assert float((end.position - seen.position).norm()) < 2.7e-3
     assert controller.focus.off_rotation(end.minus(seen.state)) < 0.6 * DEG
 

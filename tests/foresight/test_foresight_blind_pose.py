@@ -10,7 +10,7 @@ import torch
 
 from torch_ekm._noise import NOISE
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.foresight import BlindPose, pose_filter
+from torch_ekm.foresight import BlindPose, blind_pose
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus, PlantWrapper
@@ -82,7 +82,7 @@ def missed(plant: BlindPose, seen: Observation) -> torch.Tensor:
 def test_joints_and_touch_find_what_the_prediction_misses(turned, monkeypatch) -> None:
     hand, made = turned
     assert float(hand.rotation_axis @ made[-1].truth.state.minus(made[0].truth.state)[-3:]) > 6 * DEG
-    monkeypatch.setattr(pose_filter, "NOISE", dataclasses.replace(NOISE, joint=1e-3 * DEG))
+    monkeypatch.setattr(blind_pose, "NOISE", dataclasses.replace(NOISE, joint=1e-3 * DEG))
     plant, seen = blind(turned, scale=0.0)
     alone, predicted = blind(turned, scale=0.0, touch=False)
     error, of_prediction = (

@@ -188,10 +188,7 @@ class ClosedLoop:
     def _movements(self, target: PoseTarget, watch: Watch) -> Generator[Step, None, Stop]:
         """Look, plan, move, learn."""
         seen, halt = watch.first(self.plant.observe(), self.plant.observe)
-        self.knowledge.error.begin()
-        self.controller.reset(float(self.knowledge.error.tighter))
-        self._figures.begin(seen.a)
-        self._lessons.begin()
+        self._lessons.begin(seen)
         ends = Ends(self.safety.rule, target, self.controller, seen)
         grips = turns = 0
         decision = None
@@ -231,8 +228,12 @@ class ClosedLoop:
         self, seen: Observation, decision: Decision, ends: Ends, watch: Watch, seconds: float
     ) -> tuple[Step, Objection | None]:
         """Command, observe, learn; why the manipulation must end here, if it must."""
-        first, stopped = self._command(seen, decision)
-        began, controller, figures, report = time.perf_counter(), self.controller, self._figures, None
+        controller, figures, guards, report = self.controller, self._figures, self.safety.guards, None
+        ways = torch.stack([one.action for one in decision.pieces]).cumsum(0)
+        path = Path.through(torch.stack([figures.motors(way) for way in ways]), guards.speed)
+        on_the_way = OnTheWay(guards, seen, decision)
+        first = self.plant.send_path(path, on_the_way, seen, "turn" if decision.turns else "grip")
+        began = time.perf_counter()
 
         def expect(moved: Tensor) -> Expectation:
             return controller.expect(decision.pieces, figures.pulled(moved))
@@ -240,27 +241,19 @@ class ClosedLoop:
         verdict = watch.motion(seen, decision, self.plant.sent, first, expect, self.plant.observe)
         after, halt, expected = verdict.seen, verdict.halt, verdict.expected
         increment, pull = after.state.minus(seen.state), after.a - seen.a
-        if halt is None and after.status is not PlantStatus.LOST:  # else nobody learns from this reading
+        if halt is None and expected is not None:  # else nobody learns from this reading
             moved = pull
             self.plant.learn(after)
             halt = watch.stuck(seen, decision, after, self.knowledge.servo.stuck)
-            if expected is not None and after.status is PlantStatus.HELD and self.learn:
+            if after.status is PlantStatus.HELD and self.learn:
                 teaches = verdict.teaches and halt is None
                 report = self._lessons.learn(seen, decision, after, moved, expected, teaches)
             controller.went(seen.a, decision.pieces)
             pull = figures.commit(moved, after.a)
             if decision.turns:
                 ends.add(after, decision.limited)
-                if watch.gated and expected is not None and not (watch.blind or watch.slid):
+                if watch.gated and not (watch.blind or watch.slid):
                     ends.leapt(float((increment - expected.increment)[-3:].norm()), verdict.note)
         seconds += time.perf_counter() - began
-        note = "; ".join(filter(None, (stopped, verdict.note)))
+        note = "; ".join(filter(None, (on_the_way.why, verdict.note)))
         return Step(seen, decision, after, increment, pull, report, seconds, note), halt
-
-    def _command(self, seen: Observation, decision: Decision) -> tuple[Observation, str]:
-        """Move the motors through the pieces; the reading at rest, and what stopped them on the way."""
-        ways, guards = torch.stack([one.action for one in decision.pieces]).cumsum(0), self.safety.guards
-        path = Path.through(torch.stack([self._figures.motors(way) for way in ways]), guards.speed)
-        watch = OnTheWay(guards, seen, decision)
-        after = self.plant.send_path(path, watch, seen, "turn" if decision.turns else "grip")
-        return after, watch.why

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -13,19 +12,16 @@ import torch
 from .._checks import check_finite, check_kind, check_shape
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
+from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, SolverError
 from ..kinematics import GraspState
-from ..model import ContactMotion, KinematicModel, ModelStatus
+from ..model import ContactMotion, KinematicModel, Linearization, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, Piece, StopReason, made_of, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
 from .program import DEGREE, ControlProblem, ControlSolution, LinearizedModel, Situation, as_array, build_qp
 from .tasks import DEFAULT_LIMITS, DEFAULT_TASKS, Limit, LimitingFunction, StepBound, Task, contact_travel
-
-if TYPE_CHECKING:
-    from ..estimation.force_sensitivity import ForceSensitivity
-    from ..estimation.hand_figures import DescribedFigures, HandFigures
-    from ..model import Linearization
 
 _BOUND = StepBound()
 _LIST = "a list of objects with a method rows(model, seen)"
@@ -249,13 +245,7 @@ class LookAndMoveController:
         error: Float[Tensor, " 6"],
         desired: Float[Tensor, " n_x"],
     ) -> Situation:
-        """What the rows of tasks and limits are made from.
-
-        Args:
-            force: as :meth:`believed` [N].
-            error: e.
-            desired: dx_d.
-        """
+        """What the rows of tasks and limits are made from: forces as :meth:`believed` [N], e, and dx_d."""
         hand = self.kinematic.hand
         alone = None  # without the pads, where these leave a torque of the joints unexplained
         if force is not None and any(one.kind is ModelStatus.UNEXPLAINED_TORQUE for one in lin.doubts):

@@ -6,19 +6,17 @@ import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 
 from .._noise import DEGREE
 from ..kinematics import GraspState
+from ..model import Linearization
 from ..plant import Observation
 from ..residual import UpdateReport
 from ..typing import Float, Tensor
 from .focus import FocusedPose, PoseTarget
-
-if TYPE_CHECKING:
-    from ..model import Linearization
 
 _STOPPED = 0.9  # of a movement: what falls shorter was stopped, and servos do not explain it
 _WEAK, _FIRM = 0.55, 0.75  # of the wanted grip: with which nothing is turned, and with which steps are whole
@@ -194,11 +192,6 @@ class Expectation(NamedTuple):
     """As they were made."""
     normal: Float[Tensor, " n_pads"] | None
     """Force of each pad after it [N]; NaN of one that does not touch; None: unknown."""
-
-    @property
-    def shares(self) -> list[float]:
-        """Of the way, that each piece is."""
-        return shares(self.pieces)
 
 
 def shares(pieces: Sequence[Piece]) -> list[float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,14 +14,12 @@ from .._noise import DEGREE
 from ..exceptions import CommandRefusedError, GraspError, ParameterError
 from ..plant import Observation, PlantStatus
 from ..plant.frames_at_rest import mean_reading
+from .controller import LookAndMoveController
 from .decision import Stop, StopReason
 from .focus import A_TARGET, PoseTarget
 from .guards import Guards
 from .tasks import ActuatorLimit
-
-if TYPE_CHECKING:
-    from .controller import LookAndMoveController
-    from .watch import Watch
+from .watch import Watch
 
 _WEAK = 0.035  # of the largest gain: a direction that motors do not hold; those that they hold have .07
 _LEAP = math.radians(4)  # of a pose beyond what was predicted, where nothing else has changed: worth a word
@@ -123,13 +120,8 @@ class Ends:
         return mean, len(readings)
 
     def over(self, seen: Observation, looks: int, stopped: bool, declines: bool) -> Stop | None:
-        """Why the manipulation ends before the next movement; None: it goes on.
-
-        Args:
-            looks: readings at rest of which ``seen`` is the mean.
-            stopped: somebody has asked for the end.
-            declines: a target out of reach ends it.
-        """
+        """Why the manipulation ends before the next movement; None: it goes on. ``seen`` is the mean of
+        ``looks`` readings; ``stopped``: somebody has asked for the end; ``declines``: what is out of reach."""
         held, focus, rule = seen.status is PlantStatus.HELD, self._controller.focus, self.rule
         if seen.status is PlantStatus.LOST:
             return Stop(StopReason.OBJECT_LOST, seen)

@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
 from .._noise import DEGREE, NOISE
+from ..description import HandDescription
 from ..exceptions import ParameterError
 from ..plant import Observation, PlantStatus, Stamps
 from ..typing import Array, Tensor
 from .decision import Expectation, StopReason
-
-if TYPE_CHECKING:
-    from ..description import HandDescription
-    from .focus import FocusedPose
+from .focus import FocusedPose
 
 _MAX_AGE = Stamps(encoders=0.2, joints=0.2, pose=0.4, fingertips=0.4)
 _SENSORS = "the encoders' reading", "the joints' reading", "the object's pose"
@@ -153,17 +151,16 @@ class ReadingTests:
         return gravest(said)
 
     def after_motion(
-        self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation | None, blind: int
+        self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation, blind: int
     ) -> Objection | None:
         """Of a reading after the motors were sent by ``sent`` [rad], the gravest; ``blind`` motions without a
         pose came before."""
         said = self._ages(seen, before)
         unseen = bool(said)  # the rest is still looked at
         said += self.motors(before, sent, seen)
-        if expected is not None:
-            ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
-            said += self._jumps(ds, predicted, seen, unseen)
-            said += [] if unseen else self._gate(before, ds, expected, seen, blind)
+        ds, predicted = seen.state.minus(before.state).numpy(), expected.increment.numpy()
+        said += self._jumps(ds, predicted, seen, unseen)
+        said += [] if unseen else self._gate(before, ds, expected, seen, blind)
         return gravest(said)
 
     def _ages(self, seen: Observation, before: Observation | None) -> list[Objection]:

@@ -8,7 +8,7 @@ import os
 import statistics
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import nn
@@ -27,10 +27,8 @@ from ..plant import Observation, PlantStatus
 from ..residual import UpdateReport
 from ..residual.files import known_classes, read, rebuild, write
 from ..typing import Float, Tensor
-from .decision import Decision, Expectation
-
-if TYPE_CHECKING:
-    from .controller import LookAndMoveController
+from .controller import LookAndMoveController
+from .decision import Decision, Expectation, shares
 
 _START = 0.07, 0.2  # along and across, of a hand of which nothing is known
 _RECENT = 0.25  # weight of the last motion,
@@ -263,17 +261,18 @@ class Lessons:
         self._controller, self._knowledge, self._figures = controller, knowledge, figures
         self._gaps: list[float] = []  # [m]
 
-    def begin(self) -> None:
+    def begin(self, seen: Observation) -> None:
         """A manipulation begins; the object may be another one."""
+        error = self._knowledge.error
+        error.begin()
+        self._controller.reset(float(error.tighter))
+        self._figures.begin(seen.a)
         self._gaps, self._controller.kinematic.surface = [], 0.0
 
     def touch(self, seen: Observation, otherwise: Callable[[Observation], float]) -> None:
         """Where the object's surface is, by the gaps of the pads that press: the median of each reading, for
-        one pad may be off alone, and the mean of readings.
-
-        Args:
-            otherwise: what another explanation of the gaps leaves of them, rms [m]; the better one counts.
-        """
+        one pad may be off alone, and the mean of readings; unless another explanation of the gaps leaves less
+        of them, ``otherwise`` [m]."""
         model = self._controller.kinematic
         names = model.pressing(seen.fingertip_force)
         if not (self._figures.learns and names and isinstance(model.detector, ContactDetector)):
@@ -297,14 +296,9 @@ class Lessons:
         expected: Expectation,
         teaches: bool,
     ) -> UpdateReport | None:
-        """The share of :class:`ModelError`, and a tighter grip of an object that slides; then forces, figures
-        and g; None: g learns nothing.
-
-        Args:
-            moved: by the encoders [rad].
-            expected: of that.
-            teaches: nothing speaks against the readings.
-        """
+        """The share of :class:`ModelError`, and a tighter grip of an object that slides; then, where nothing
+        speaks against the readings, forces, figures and g; None: g learns nothing. The encoders ``moved``
+        [rad], ``expected`` is what was to come of it."""
         controller, error, increment = self._controller, self._knowledge.error, after.state.minus(seen.state)
         if decision.turns and seen.status is PlantStatus.HELD:  # both ends were measured
             off, way = (increment - expected.increment)[-3:], expected.increment[-3:]
@@ -328,18 +322,14 @@ class Lessons:
     def learn_increment(
         self, expected: Expectation, moved: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
     ) -> UpdateReport | None:
-        """Figures and g learn: g piece by piece, each with its share of what was not predicted, what the
-        figures leave of it.
-
-        Args:
-            increment: ds, as measured.
-        """
+        """Figures and g learn of ds: g piece by piece, each with its share of what was not predicted, what
+        the figures leave of it."""
         enhanced, model, report, done = self._controller.enhanced, self._controller.kinematic, None, 0.0
         assert enhanced is not None
         path = [(one.linearization, one.action) for one in expected.pieces]
         self._figures.learn_path(path, moved, increment - expected.nominal, expected.nominal)
         rest = increment - expected.increment
-        for one, share in zip(expected.pieces, expected.shares, strict=True):
+        for one, share in zip(expected.pieces, shares(expected.pieces), strict=True):
             lin = one.linearization
             nominal = one.nominal + model.followed(lin).step(one.action) - lin.step(one.action)
             state = one.state.plus(done * rest) if done else one.state

@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from .._noise import DEGREE, NOISE
 from ..exceptions import GraspError
-from ..model import ModelStatus
+from ..model import KinematicModel, Linearization, ModelStatus
 from ..plant import Observation
 from ..typing import Array, Tensor
 from .decision import Decision, Expectation, StopReason
 from .guards import CHECK_PLANT, Effect, Guards, Objection, ReadingTests, against, deg
-
-if TYPE_CHECKING:
-    from ..model import KinematicModel, Linearization
 
 _NOWHERE = 0.5 * DEGREE  # an encoder moves less in a motion in which its motor is sent nowhere
 _AGAINST = 0.3  # share of a motion that is made the other way; healthy hands make .4 of it and more
@@ -49,7 +45,7 @@ class MotionTests:
         self._begun = seen
 
     def after(
-        self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation | None
+        self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation
     ) -> list[Objection]:
         """Encoders that drift, and joints and object that go another way than the encoders."""
         names, moved = self.hand.actuator_names, (seen.a - before.a).where((sent == 0).all(0), 0.0)
@@ -58,8 +54,6 @@ class MotionTests:
         drifts += f"{deg(_NOWHERE)}): {_MAGNET}"
         reason, wrong = StopReason.ENCODER_DRIFT, float(moved[i].abs()) > _NOWHERE
         said = against(wrong, reason, drifts, Effect.LIES, running=3)
-        if expected is None:
-            return said
         share, sharp = self.readings.share(before, seen, expected.nominal)
         back = f"joints and object made {share:.1f} of the motion that the encoders' motion predicts (limit "
         back += f"-{_AGAINST:g}): a sign of motors, encoders or joints is wrong, or the pose's frame; "

@@ -15,16 +15,15 @@ from ..exceptions import ParameterError
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Tensor
+from .controller import LookAndMoveController
 from .decision import Band, Decision, StopReason, Waypoint
 from .focus import FocusedPose, PoseTarget
-from .rehearsal import DEVIATIONS, LONGEST, Bands, End, PathEnd, Rehearsal, is_loose, lets_go
+from .knowledge import HandKnowledge
+from .model_hand import ModelHand
+from .rehearsal import DEVIATIONS, LONGEST, End, PathEnd, Rehearsal, is_loose, lets_go
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from .controller import LookAndMoveController
-    from .knowledge import HandKnowledge
-    from .model_hand import ModelHand
 
 _AHEAD = 3  # pieces that come no nearer, after which the path ends where it was nearest
 _BACK = 1.5  # times off_rotation from which an object that is farther off is not turned back: it slips out
@@ -171,18 +170,18 @@ class WholeTurn:
                 return Plan(target, focus, seen.state, decision)
         off = focus.off_rotation(target.error(seen.state))
         most = max(self.off_rotation, min(off, _BACK * self.off_rotation))
-        rehearsal = Rehearsal(controller, seen, target, self.piece, longest, hand=hand)
-        bands, spare = Bands(controller, knowledge, seen, target), rehearsal.hand.margin
+        rehearsal = Rehearsal(controller, knowledge, seen, target, self.piece, longest, hand=hand)
+        spare = rehearsal.hand.margin
         waypoints: list[Waypoint] = []
         asked = focus.error(target, seen.state)
         safe, against, nearest = 0, "", (asked, 0)
-        for piece, state in rehearsal.pieces():
-            waypoints.append(Waypoint(piece, state, bands.add(piece, state)))
+        for waypoint in rehearsal.path():
+            waypoints.append(waypoint)
             against = against or self._against(waypoints, most, spare)
             if len(waypoints) == 1:
-                against = against or lets_go(rehearsal.hand.hand, piece, self.deviations)
+                against = against or lets_go(rehearsal.hand.hand, waypoint.piece, self.deviations)
             safe += not against
-            left = focus.error(target, state)
+            left = focus.error(target, waypoint.state)
             nearest = min(nearest, (left, len(waypoints)))
             since = len(waypoints) - nearest[1]
             if since >= _AHEAD or (since and nearest[0] < _CLOSE):
@@ -202,11 +201,8 @@ class WholeTurn:
         return Plan(target, focus, seen.state, decision, tuple(waypoints), safe, end, against)
 
     def _against(self, path: Sequence[Waypoint], most: float, spare: Tensor) -> str:
-        """Why the last of some waypoints is not safe; empty: it is.
-
-        Args:
-            spare: ``mu_s f_n - |f_t|`` of each pad before the first [N].
-        """
+        """Why the last of some waypoints is not safe; empty: it is. ``spare`` is ``mu_s f_n - |f_t|`` of each
+        pad before the first [N]."""
         band, piece, first = path[-1].band, path[-1].piece, len(path) == 1
         off = self._off(band, most + (self.margin if first else 0.0))
         if off or first or band.force is None or band.force_std is None:
@@ -230,12 +226,9 @@ class WholeTurn:
     ) -> tuple[Decision | None, ModelHand | None]:
         """The movement that grips as the object needs it, as far as it is safe; None: it is gripped so, or
         grips no better. And the hand of the model, if it still stands where it began."""
-        here = PoseTarget(seen.position, seen.rotation)
-        rehearsal = Rehearsal(controller, seen, None, self.piece, firm=firm)
-        bands = Bands(controller, knowledge, seen, here)
+        rehearsal = Rehearsal(controller, knowledge, seen, None, self.piece, firm=firm)
         waypoints: list[Waypoint] = []
-        for piece, state in rehearsal.pieces():
-            waypoint = Waypoint(piece, state, bands.add(piece, state))
+        for waypoint in rehearsal.path():
             if len(waypoints) == _GRIP or self._off(waypoint.band, self.off_rotation):
                 break
             waypoints.append(waypoint)
@@ -244,6 +237,7 @@ class WholeTurn:
         hand = rehearsal.hand
         if hand.failure is None:
             return None, None if hand.time else hand
+        here = PoseTarget(seen.position, seen.rotation)
         decision = controller.decide(seen.state, seen.a, here, seen.fingertip_force)  # the model refuses
         loose = decision.status is StopReason.RUNNING and is_loose(decision, firm)
         return dataclasses.replace(decision, turns=False) if loose else None, None

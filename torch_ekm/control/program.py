@@ -8,22 +8,20 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from .._extras import require
 from .._noise import DEGREE
 from ..contact.forces.solve import EqualityProgram, solve_by_active_set
+from ..description import HandDescription
 from ..enhanced import EnhancedModel
 from ..exceptions import NonFiniteError, ParameterError, ShapeError, SolverError
 from ..kinematics import GraspState
+from ..model import Linearization
 from ..typing import Array, Float, Tensor
 from .focus import FocusedPose
-
-if TYPE_CHECKING:
-    from ..description import HandDescription
-    from ..model import Linearization
 
 Numbers = Tensor | Array | float
 

@@ -6,29 +6,26 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from enum import Enum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from .._noise import DEGREE, NOISE
+from ..description import HandDescription
 from ..estimation.hand_figures import HandFigures
 from ..exceptions import NoContactError, UnstableGraspError
 from ..kinematics import GraspState
+from ..model import Linearization
 from ..model.softening import softened
 from ..plant import Observation
 from ..typing import Array, Float, Tensor
-from .decision import Band, Decision, Piece, StopReason
+from .controller import LookAndMoveController
+from .decision import Band, Decision, Piece, StopReason, Waypoint
 from .focus import PoseTarget
-from .knowledge import STEADY
+from .knowledge import STEADY, HandKnowledge
 from .model_hand import ModelHand
 from .tasks import LimitingFunction
-
-if TYPE_CHECKING:
-    from ..description import HandDescription
-    from ..model import Linearization
-    from .controller import LookAndMoveController
-    from .knowledge import HandKnowledge
 
 DEVIATIONS = 2.0
 """At which a waypoint, and a piece from rest, is safe."""
@@ -175,20 +172,17 @@ class End(NamedTuple):
 
 
 class Rehearsal:
-    """Motions of a controller on a :class:`ModelHand`; nothing that they do changes the controller.
+    """Motions of a controller on a :class:`ModelHand`, in steps of ``piece`` [rad], until an actuator has
+    gone ``longest`` [rad]; nothing that they do changes the controller.
 
-    Args:
-        seen: where they begin, as measured.
-        target: where the object shall be; None: it stays where it is, and is gripped as it should be.
-        piece: largest step [rad].
-        longest: way of an actuator [rad].
-        firm: share of the wanted grip with which nothing is gripped.
-        hand: which stands there already.
+    Without a target the object stays where it is, and is gripped as it should be, unless ``firm`` of that
+    grip is there; ``hand`` stands where the motions begin already.
     """
 
     def __init__(
         self,
         controller: LookAndMoveController,
+        knowledge: HandKnowledge,
         seen: Observation,
         target: PoseTarget | None,
         piece: float,
@@ -202,7 +196,8 @@ class Rehearsal:
         model = controller.kinematic if controller.enhanced is None else controller.enhanced
         if hand is None:
             hand = ModelHand(model, seen.state, seen.a, seen.fingertip_force, controller.forces)
-        self.hand = hand
+        self.hand, at = hand, PoseTarget(seen.position, seen.rotation) if target is None else target
+        self._bands = Bands(controller, knowledge, seen, at)
         self._measures, self._idle = seen.fingertip_force is not None, set(self.hand.at_limits())
         self.first: Decision | None = None
         """The first one, with the grip before anything moves."""
@@ -210,8 +205,8 @@ class Rehearsal:
         self._too_long, self._most = False, math.inf
 
     @torch.no_grad()
-    def pieces(self) -> Iterator[tuple[Piece, GraspState]]:
-        """Each piece, and where it leads."""
+    def path(self) -> Iterator[Waypoint]:
+        """Each piece, where it leads, and how sure the model is of that."""
         controller, hand, way = self._controller, self.hand, torch.zeros_like(self.hand.a)
         for _ in range(_MOST):
             here = hand.observe()
@@ -237,7 +232,7 @@ class Rehearsal:
             if hand.failure is None:
                 f, after = hand.increment - hand.correction, hand.force if self._measures else None
                 made = Piece(lin, decision.delta_a, f, hand.increment, after, hand.said, hand.margin)
-                yield made, hand.state
+                yield Waypoint(made, hand.state, self._bands.add(made, hand.state))
 
     def _decide(self, here: Observation, force: Tensor | None, lin: Linearization) -> Decision:
         controller, focus = self._controller, self._controller.focus

@@ -4,31 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
 from .._checks import check_positive
 from .._noise import DEGREE
+from ..description import HandDescription
 from ..exceptions import ParameterError, UnknownNameError
 from ..kinematics.se3 import hat
+from ..model import Linearization
 from ..typing import Array, Float, Tensor
-from .program import (
-    Bounds,
-    Equality,
-    Inequality,
-    LinearizedModel,
-    Situation,
-    Squares,
-    as_array,
-    grip_shares,
-)
-
-if TYPE_CHECKING:
-    from ..description import HandDescription
-    from ..model import Linearization
-    from .decision import Decision
+from .decision import Decision
+from .program import Bounds, Equality, Inequality, LinearizedModel, Situation, Squares, as_array, grip_shares
 
 _UNMEASURED = 2.0  # [N] more that is wanted where no pad measures
 _OFF_ROTATION, _OFF_TRAVEL = 1.5 * DEGREE, 2.5e-3  # [rad], [m] that a step may leave the focus
@@ -308,12 +297,7 @@ class LimitingFunction:
     None: no such limit."""
 
     def __call__(self, error: Float[Tensor, " n_x"], travel: float = 0.0) -> Float[Tensor, " n_x"]:
-        """dx_d.
-
-        Args:
-            error: e, focused error.
-            travel: ``|v(e)|``, see :func:`contact_travel` [m].
-        """
+        """dx_d, of a focused error e with ``travel`` = ``|v(e)|`` [m], see :func:`contact_travel`."""
         size = self.steps(error, travel)
         return error * min(self.gain, 1 / size) if size > 0 else error
 
@@ -345,11 +329,7 @@ class StepBound:
     """
 
     def share(self, decision: Decision, seen: Situation, asked: float) -> float:
-        """phi of a step.
-
-        Args:
-            asked: its size in units of the largest.
-        """
+        """phi of a step; ``asked`` is its size in units of the largest."""
         grip = 1.0 if decision.grip is None else decision.grip.bears
         phi = max(min(self._share(decision, seen), grip), min(1.0, _LEAST / max(asked, 1e-9)))
         return phi if seen.fingertip_force is None else min(phi, grip)  # an estimate is no reason to wait

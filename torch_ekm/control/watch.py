@@ -5,23 +5,20 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from .._noise import DEGREE, NOISE
+from ..model import KinematicModel
 from ..plant import Observation, PlantStatus
 from ..typing import Array, Tensor
 from .decision import Decision, Expectation, StopReason
 from .guards import Effect, Guards, Objection, ReadingTests, against, agree, deg, gravest
-from .knowledge import felt
+from .knowledge import HandKnowledge, felt
 from .motions import FingertipTests, MotionTests
 from .rehearsal import DEVIATIONS
-
-if TYPE_CHECKING:
-    from ..model import KinematicModel
-    from .knowledge import HandKnowledge
 
 _LOOKS = 2  # further readings of a sensor that is in doubt
 _STILL = 0.05 * DEGREE  # an encoder that moves less stands
@@ -45,7 +42,7 @@ class Verdict(NamedTuple):
     note: str = ""
     """What a guard objects to where the loop goes on."""
     expected: Expectation | None = None
-    """What f + g predict of what the encoders did; None: the model has no step."""
+    """What f + g predict of what the encoders did; None: the object is lost."""
 
 
 class Watch:
@@ -97,9 +94,9 @@ class Watch:
     ) -> Verdict:
         """Judge a movement of the motors by ``sent`` [rad]; ``expect`` gives f + g of what the encoders did,
         ``look`` another reading where the first is in doubt."""
-        seen, last, doubt, expected = self._look(before, decision, sent, after, expect, look)
+        seen, last, doubt, expected = self._look(before, sent, after, expect, look)
         self.slid = ""
-        if seen.status is PlantStatus.LOST:
+        if expected is None:
             return Verdict(seen, False)
         sure = last is not None and agree(last, seen, self.guards)
         if doubt is not None and doubt.effect is Effect.STOP:
@@ -112,7 +109,7 @@ class Watch:
         if force is not seen.fingertip_force:
             seen = dataclasses.replace(seen, fingertip_force=force)
         if doubt is not None and (doubt.effect is Effect.BLIND or not sure):  # the model predicts the pose
-            pose = before.state if expected is None else before.state.plus(expected.increment)
+            pose = before.state.plus(expected.increment)
             at = {"position": pose.position, "rotation": pose.rotation, "status": PlantStatus.NOT_SEEN}
             self.blind += 1
             return self._verdict(dataclasses.replace(seen, **at), False, doubt, expected, said)
@@ -126,24 +123,24 @@ class Watch:
     def _look(
         self,
         before: Observation,
-        decision: Decision,
         sent: Tensor,
         seen: Observation,
         expect: Callable[[Tensor], Expectation],
         look: Look,
     ) -> tuple[Observation, Observation | None, Objection | None, Expectation | None]:
-        """The reading to be judged, the look before it, what speaks against it, and what was expected."""
+        """The reading to be judged, the look before it, what speaks against it, and what was expected; None:
+        the object is lost."""
         last, expected = None, None
         for left in range(_LOOKS, -1, -1):
             if seen.status is PlantStatus.LOST:
                 break
-            if decision.pieces and (last is None or not torch.equal(seen.a, last.a)):
+            if expected is None or last is None or not torch.equal(seen.a, last.a):
                 expected = expect(seen.a - before.a)
             doubt = self.readings.after_motion(before, sent, seen, expected, self.blind)
             if left == 0 or (doubt is None and not self.fingertips.high(seen)):
                 return seen, last, doubt, expected
             last, seen = seen, _with_events(look(), seen)
-        return seen, last, None, expected
+        return seen, last, None, None
 
     def _in_succession(self, said: list[Objection]) -> list[Objection]:
         """With the end of the manipulation, where a test objects in as many motions running as it may."""
@@ -157,7 +154,7 @@ class Watch:
         seen: Observation,
         teaches: bool,
         doubt: Objection | None,
-        expected: Expectation | None,
+        expected: Expectation,
         said: list[Objection],
     ) -> Verdict:
         most = self.guards.blind_motions
@@ -174,13 +171,9 @@ class Watch:
         halt = next((one for one in said if one.effect is Effect.STOP), None)
         return Verdict(seen, teaches, halt, "; ".join(filter(None, notes)), expected)
 
-    def _slid(
-        self, reason: StopReason, before: Observation, expected: Expectation | None, seen: Observation
-    ) -> str:
+    def _slid(self, reason: StopReason, before: Observation, expected: Expectation, seen: Observation) -> str:
         """What two looks show that agree is true of a pose where the grip has changed, too, and of a joint
         where the pads that press lie on the object; empty: it is not."""
-        if expected is None:
-            return ""
         came = felt(self.hand, expected, before, seen) if reason is StopReason.POSE_JUMP else None
         changed = came is not None and came.wrong
         if not (changed or (reason is StopReason.JOINT_JUMP and self.motions.on_surface(seen))):
