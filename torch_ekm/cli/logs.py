@@ -63,7 +63,7 @@ def verify(log: Annotated[Path, Argument(help="Folder of the log.")]) -> None:
     wrong, with 0 if not.
     """
     from ..plant import verify_log
-    from ..plant.verification import Finding
+    from ..plant.trial_log import Finding
 
     found = verify_log(log)
     print_table(Finding._fields, found, str(log))

@@ -13,7 +13,7 @@ from .._checks import check_kind
 from .._noise import DEGREE
 from ..exceptions import CommandRefusedError, GraspError, ParameterError
 from ..plant import Observation, PlantStatus
-from ..plant.frames_at_rest import mean_reading
+from ..plant.observation import mean_reading
 from .controller import LookAndMoveController
 from .decision import Stop, StopReason
 from .focus import A_TARGET, PoseTarget
@@ -121,7 +121,7 @@ class Ends:
 
     def over(self, seen: Observation, looks: int, stopped: bool, declines: bool) -> Stop | None:
         """Why the manipulation ends before the next movement; None: it goes on. ``seen`` is the mean of
-        ``looks`` readings; ``stopped``: somebody has asked for the end; ``declines``: what is out of reach."""
+        ``looks`` readings; ``stopped``: somebody has asked for it; ``declines``: what is out of reach."""
         held, focus, rule = seen.status is PlantStatus.HELD, self._controller.focus, self.rule
         if seen.status is PlantStatus.LOST:
             return Stop(StopReason.OBJECT_LOST, seen)

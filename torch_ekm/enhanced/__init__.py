@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from ..estimation.parameter_filter import ParameterFilter
 from .adaptive_model import AdaptiveModel
-from .encoding import GraspEncoding
 from .enhanced_model import EnhancedModel
-from .grasp_learner import grasp_learner
+from .grasp import GraspEncoding, grasp_learner
 from .saving import load, save
 
 __all__ = [

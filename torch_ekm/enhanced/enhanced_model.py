@@ -19,8 +19,7 @@ from ..residual.kernels.action_linear import ActionLinearKernel
 from ..residual.report import Expected, UpdateReport
 from ..typing import Float, Tensor
 from .adaptive_model import differentiated, finite_differences
-from .encoding import GraspEncoding
-from .grasp_learner import grasp_learner
+from .grasp import GraspEncoding, grasp_learner
 
 if TYPE_CHECKING:
     from ..model import KinematicModel

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from .. import interop, residual
-from ..enhanced.grasp_learner import ACTION_VARIANCE, NOISE_VARIANCE, grasp_kernel
+from ..enhanced.grasp import ACTION_VARIANCE, NOISE_VARIANCE, grasp_kernel
 from ..exceptions import UnknownNameError
 from ..residual import ResidualLearner
 

@@ -21,7 +21,7 @@ from ..control import (
 )
 from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
-from ..enhanced.grasp_learner import SMALL_ACTION_VARIANCE
+from ..enhanced.grasp import SMALL_ACTION_VARIANCE
 from ..exceptions import EquilibriumError, GraspError, NoContactError
 from ..foresight import BlindPose
 from ..kinematics import GraspState

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from .frames_at_rest import FramesAtRest
 from .gate import Gate
 from .observation import Observation, PlantStatus, Stamps, Truth
-from .plant import FollowingPlant, Path, Plant, PlantWrapper, can_follow
+from .plant import FollowingPlant, FramesAtRest, Path, Plant, PlantWrapper, can_follow
 from .recorded import RecordingPlant, ReplayedPlant
 from .servo_inverse import ServoInverse
 from .trajectory import Movement, Trajectory
-from .trial_log import TrialLog
-from .verification import verify_log
+from .trial_log import TrialLog, verify_log
 
 __all__ = [
     "FollowingPlant",

@@ -1,10 +1,10 @@
-"""A reading of a hand, and the one place where a plant's reading is looked at."""
+"""A reading of a hand, the mean of several, and the one place where a plant's reading is looked at."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
@@ -16,6 +16,7 @@ from .._checks import check_finite, check_kind, check_shape
 from ..description import HandDescription
 from ..exceptions import ParameterError
 from ..kinematics import GraspState
+from ..kinematics.se3 import exp, log
 from ..typing import Float, Tensor
 
 
@@ -124,7 +125,55 @@ class Observation:
         return GraspState(self.q, self.position, self.rotation)
 
 
+_OUTLIER = 4.0  # times the median distance from the median: 6 standard deviations of a Gaussian in space
 _ROUNDED = 1e-6  # of the largest entry of a covariance: what rounding may leave of its symmetry and sign
+
+
+def mean_reading(readings: Sequence[Observation]) -> Observation:
+    """What several readings of a hand at rest say together, see :class:`FramesAtRest`."""
+    shown = [o for o in readings if o.status is PlantStatus.HELD]
+    last = readings[-1]
+    position, rotation, status, stamps = last.position, last.rotation, PlantStatus.NOT_SEEN, last.stamps
+    covariance = last.q.new_full((6, 6), torch.nan)
+    if shown:
+        status = PlantStatus.HELD
+        position, rotation, covariance = _mean_pose(shown)
+        stamps = last.taken._replace(pose=min(o.taken.pose for o in shown))  # no newer than any of them
+    forces = [o.fingertip_force for o in readings if o.fingertip_force is not None]
+    info = {**last.info, **{name: readings[0].info[name] for name in ("events",) if name in readings[0].info}}
+    info["estimate"] = {**info.get("estimate", {}), "pose_covariance": covariance}
+    return dataclasses.replace(
+        last,
+        q=torch.stack([o.q for o in readings]).mean(0),
+        position=position,
+        rotation=rotation,
+        fingertip_force=torch.stack(forces).mean(0) if forces else None,
+        status=status,
+        info=info,
+        stamps=stamps if last.dated else None,
+    )
+
+
+def _mean_pose(
+    frames: Sequence[Observation],
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"], Float[Tensor, "6 6"]]:
+    """Robust mean of the poses, and its covariance."""
+    o, R = torch.stack([f.position for f in frames]), torch.stack([f.rotation for f in frames])
+    centre = R[0]
+    for _ in range(2):  # an outlier may come first: its tangent space is not that of the others
+        centre = exp(log(R @ centre.mT).quantile(0.5, dim=0)) @ centre
+    twist = torch.cat([o - o.quantile(0.5, dim=0), log(R @ centre.mT)], dim=-1)
+    away = torch.linalg.vector_norm(twist.unflatten(-1, (2, 3)), dim=-1)
+    away = (away / away.quantile(0.5, dim=0).clamp_min(1e-12)).amax(-1)
+    kept = away <= _OUTLIER * away.quantile(0.5).clamp_min(1.0)
+    n = int(kept.sum())
+    stated = [f.info.get("estimate", {}).get("pose_covariance") for f in frames]
+    if all(covariance is not None for covariance in stated):
+        covariance = torch.stack(stated)[kept].mean(0) / n
+    else:
+        covariance = torch.diag_embed(twist[kept].var(0)) if n > 1 else twist.new_full((6, 6), torch.nan)
+        covariance = covariance / n
+    return o[kept].mean(0), exp(twist[kept, 3:].mean(0)) @ centre, covariance
 
 
 def readable(seen: Observation, hand: HandDescription) -> Observation:
