@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from .._checks import check_shape
-from ..estimation.parameter_filter import FilterReport, ParameterFilter
+from ..estimation.parameter_filter import ParameterFilter
 from ..exceptions import NoDerivativeError, ParameterError
 from ..residual.derivatives import recordable, value_and_jacobian
 from ..typing import Float, Tensor
@@ -89,10 +89,8 @@ class AdaptiveModel(nn.Module):
         """``f(s, da; m)``."""
         return self.function(state, action, self.theta.mean.to(action))
 
-    def adapt(
-        self, state: Any, action: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
-    ) -> FilterReport:
-        """Learn from one motion.
+    def adapt(self, state: Any, action: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]) -> float:
+        """Learn from one motion; z of the filter.
 
         Raises:
             NoDerivativeError: f carries no derivative by theta.

@@ -22,7 +22,7 @@ from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
 from ..model.motion_equations import Motion, MotionEquations
 from ..model.reduction import Drives
 from ..typing import Array, Float, Tensor
-from .parameter_filter import FilterReport, ParameterFilter
+from .parameter_filter import ParameterFilter
 
 KINDS = ("springs", "moment_arms", "stiffness", "backlash")
 # of the prior, in units of those of the calibration: one lathe turns all pulleys, one cable strings them
@@ -263,7 +263,7 @@ class HandFigures(ParameterFilter):
     @torch.no_grad()
     def learn(
         self, lin: Linearization, moved: Float[Tensor, " n_a"], increment: Float[Tensor, " n_s"]
-    ) -> FilterReport | None:
+    ) -> float | None:
         """Learn from one motion: :meth:`learn_path` of a single piece.
 
         Args:
@@ -290,7 +290,7 @@ class HandFigures(ParameterFilter):
         moved: Float[Tensor, " n_a"],
         off: Float[Tensor, " n_s"],
         nominal: Float[Tensor, " n_s"],
-    ) -> FilterReport | None:
+    ) -> float | None:
         """Learn from one movement.
 
         Args:
@@ -300,7 +300,8 @@ class HandFigures(ParameterFilter):
             nominal: what f predicts.
 
         Returns:
-            None: the movement cannot be modelled, went against its prediction, or nothing moved.
+            z of the filter; None: the movement cannot be modelled, went against its prediction, or nothing
+                moved.
 
         Raises:
             ShapeError, NonFiniteError: nothing is changed.

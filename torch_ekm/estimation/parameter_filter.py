@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,19 +67,6 @@ _DRIFT = 1e-3  # q: share of the prior that comes back with each motion
 _SURPRISE = 3.0  # times what is usual, from which a motion counts less, and speaks for a change
 _RECENT = 0.05  # weight of the last motion in what is usual
 _IN_A_ROW = 2  # such motions in succession are a change: a contact that slides once is none
-
-
-class FilterReport(NamedTuple):
-    """What one motion taught."""
-
-    surprise: float
-    """z = ``r' S^-1 r / n_r``, of the order of 1 where the model and its uncertainty explain the motion."""
-    weight: float
-    """w, in (0, 1]."""
-    opened: bool
-    """The parameters were taken for changed."""
-    bounded: tuple[str, ...]
-    """Parameters that stand at a bound."""
 
 
 class ParameterFilter(Recorded, nn.Module):
@@ -146,7 +133,7 @@ class ParameterFilter(Recorded, nn.Module):
         self.count = nn.Buffer(torch.zeros((), dtype=torch.int64))
         """Motions learned."""
         self.usual = nn.Buffer(torch.ones((), dtype=torch.float64))
-        """Mean of the last surprises, see :class:`FilterReport`."""
+        """u."""
         self.surprises = nn.Buffer(torch.zeros((), dtype=torch.int64))
         """Surprising motions in succession."""
         self.changed_at = nn.Buffer(torch.full((), -1, dtype=torch.int64))
@@ -169,13 +156,16 @@ class ParameterFilter(Recorded, nn.Module):
         residual: Float[Tensor, " n_r"],
         derivative: Float[Tensor, "n_r n"],
         noise: Float[Tensor, " n_r"],
-    ) -> FilterReport:
+    ) -> float:
         """Learn from one motion.
 
         Args:
             residual: r, measured less predicted at m.
             derivative: phi at m.
             noise: diagonal of R, variances of what theta does not explain.
+
+        Returns:
+            z, of the order of 1 where the model and its uncertainty explain the motion.
 
         Raises:
             ShapeError, NonFiniteError: nothing is changed.
@@ -197,8 +187,7 @@ class ParameterFilter(Recorded, nn.Module):
         most = _SURPRISE * max(1.0, float(self.usual))
         self.usual += _RECENT * (min(z, most) - self.usual)
         self.surprises.copy_(self.surprises + 1 if z > most else torch.zeros_like(self.surprises))
-        opened = int(self.surprises) >= _IN_A_ROW
-        if opened:
+        if int(self.surprises) >= _IN_A_ROW:
             self.before.copy_(self.mean)
             self.before_covariance.copy_(self.covariance)
             self.changed_at.copy_(self.count)
@@ -207,13 +196,11 @@ class ParameterFilter(Recorded, nn.Module):
         weight = min(1.0, most / z) if z > 0 else 1.0
         r, phi, R = seen
         faded = m_0 + (1 - _DRIFT) ** 0.5 * (m - m_0)
-        wanted, P = update(faded, P, r, phi, R / weight, at=m)
-        mean = np.clip(wanted, lower, upper)
+        mean, P = update(faded, P, r, phi, R / weight, at=m, bounds=(lower, upper))
         self.mean.copy_(torch.from_numpy(mean))
         self.covariance.copy_(torch.from_numpy(P))
         self.count += 1
-        bounded = tuple(self.names[i] for i in np.flatnonzero(wanted != mean))
-        return FilterReport(z, weight, opened, bounded)
+        return z
 
     def state_problems(self, state: Mapping[str, Any]) -> list[str]:
         """What is wrong with the entries of a state that is to be loaded."""
@@ -225,9 +212,7 @@ class ParameterFilter(Recorded, nn.Module):
                 wrong.append(f"{name} is out of bounds")
         if not count and not torch.equal(state["mean"], self.start.to(state["mean"])):
             wrong.append("mean is not the start, and no motion was learned")
-        most = (1 + _RECENT * (_SURPRISE - 1)) ** min(
-            count, 5000
-        )  # what so many surprises in succession make
+        most = (1 + _RECENT * (_SURPRISE - 1)) ** min(count, 5000)  # of so many surprises in succession
         surprises = 0, _IN_A_ROW - 1
         return wrong + bound_problems(state, usual=(0, most), surprises=surprises, changed_at=(-1, count))
 

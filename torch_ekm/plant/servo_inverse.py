@@ -27,8 +27,8 @@ class ServoInverse(PlantWrapper):
 
     ``|v - w| <= servo.largest``, and v goes beyond the gate's increment only where w does: no estimate makes
     a command large. Along a path each motor is compensated in the direction in which it goes, and a piece
-    that becomes longer takes longer. A loop that judges readings itself uses :meth:`send`,
-    :meth:`send_path` and :meth:`learn`, so that nothing is learned from one that it refuses.
+    that becomes longer takes longer. A loop that judges readings itself uses :meth:`send_path` and
+    :meth:`learn`, so that nothing is learned from one that it refuses.
 
     Args:
         plant: with encoders (``Observation.a``); one that is no :class:`Gate` gets one.
@@ -59,18 +59,15 @@ class ServoInverse(PlantWrapper):
             ShapeError, NonFiniteError: the increment is not ``n_a`` finite numbers; nothing moves.
             EKMError: see :meth:`Gate.command`.
         """
-        after = self.send(delta_a, self.gate.last or self.observe(), "user")
-        self.learn(after)
-        return after
-
-    def send(self, delta_a: Float[Tensor, " n_a"], start: Observation, by: str) -> Observation:
-        """The same from an accepted reading, and nothing is learned; see :meth:`Gate.command`."""
         (delta_a,), names = as_tensors(delta_a=delta_a), self.servo.names
         check_shape("delta_a", delta_a, (len(names),), f"in order: {', '.join(names)}")
         check_finite("delta_a", delta_a)
+        start = self.gate.last or self.observe()
         v, _ = self._inverse(delta_a[None], start)
         self._start, self.sent, self._known = start.a, v, torch.ones_like(self._known)
-        return self.gate.command(v[0], start, by)
+        after = self.gate.command(v[0], start)
+        self.learn(after)
+        return after
 
     def follow(  # type: ignore[override]
         self, path: Path, watch: Callable[[Observation], bool]
