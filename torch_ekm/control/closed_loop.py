@@ -129,9 +129,8 @@ class ClosedLoop:
         Nothing moves, and nothing is learned.
         """
         check_kind("target", target, PoseTarget)
-        planner, seen = self.planner, self.plant.observe()
-        planner = planner if isinstance(planner, WholeTurn) else WholeTurn()
-        return planner.plan(self.controller, seen, target, self.knowledge, 0.0, whole=True)
+        planner = self.planner if isinstance(self.planner, WholeTurn) else WholeTurn()
+        return planner.plan(self.controller, self.plant.observe(), target, self.knowledge, 0.0, whole=True)
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
         """``max |angle|`` of a :meth:`plan` about the focused axis: how far the model turns the object, and
@@ -218,11 +217,10 @@ class ClosedLoop:
                 said = decision.message, plan.end.message, ends.surprise, watch.suspects(seen)
                 return Stop(decision.status, seen, "; ".join(dict.fromkeys(filter(None, said))))
             halt = gravest(watch.fingertips.before(decision, seen, first=decision.turns and not turns))
-            if halt is not None:
-                continue
-            step, halt = self._move(seen, decision, ends, watch, seconds)
-            yield step
-            seen, grips, turns = step.after, grips + (not decision.turns), turns + decision.turns
+            if halt is None:
+                step, halt = self._move(seen, decision, ends, watch, seconds)
+                yield step
+                seen, grips, turns = step.after, grips + (not decision.turns), turns + decision.turns
 
     def _move(
         self, seen: Observation, decision: Decision, ends: Ends, watch: Watch, seconds: float

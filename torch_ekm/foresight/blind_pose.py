@@ -187,7 +187,7 @@ def _seen_covariance(stated: Tensor | None, like: Tensor) -> Tensor:
 
 
 class BlindPose(PlantWrapper):
-    """``(q, o, R)`` of a :class:`PoseFilter` in place of the camera's pose, from ``switch_off`` on.
+    """``(q, o, R)`` of a :class:`PoseFilter` in place of the camera's pose, after the first observation.
 
     Joint angles, encoders and fingertip forces go on being measured. The camera is asked again where the
     standard deviation of the rotation about the axis exceeds ``look_again``; what it then sees is one more
@@ -203,8 +203,6 @@ class BlindPose(PlantWrapper):
         model: predicts the motions.
         axis: about which the object turns, hand frame.
         look_again: [rad]; infinite: never.
-        switch_off: the camera goes off with the first observation for which this is true; None: with the
-            first one.
         touch: False leaves the pose to the prediction alone (the test that the paper leaves for the future,
             section VI).
 
@@ -219,7 +217,6 @@ class BlindPose(PlantWrapper):
         axis: Float[Tensor, " 3"],
         *,
         look_again: float = math.inf,
-        switch_off: Callable[[Observation], bool] | None = None,
         touch: bool = True,
     ) -> None:
         if not float(torch.linalg.vector_norm(axis)) > 1e-9:
@@ -230,13 +227,11 @@ class BlindPose(PlantWrapper):
         self.filter = PoseFilter(model, touch=touch)
         self.axis = axis / torch.linalg.vector_norm(axis)
         self.look_again = look_again
-        self._switch_off = switch_off
-        self.dark, self.looks = False, 0
-        """The camera is off; how often it was asked since."""
+        self.looks = 0
+        """How often the camera was asked since it is off."""
         self._tests = ReadingTests(Guards(), self.filter.kinematic.hand)
         self._sent: Tensor | None = None  # waypoints of motions from which no reading was accepted yet
-        self._before: Observation | None = None
-        """As measured, the last reading that was accepted."""
+        self._before: Observation | None = None  # as measured, the last reading that was accepted
 
     @property
     def axis_std(self) -> float:
@@ -245,7 +240,7 @@ class BlindPose(PlantWrapper):
 
     def reset(self, seed: int) -> Observation:
         """Grasp again with the camera on; the observation after it is that of the plant."""
-        self.dark, self.looks, self._before, self._sent = False, 0, None, None
+        self.looks, self._before, self._sent = 0, None, None
         return super().reset(seed)
 
     def command(self, delta_a: Float[Tensor, " n_a"]) -> Observation:
@@ -259,15 +254,13 @@ class BlindPose(PlantWrapper):
         """``seen``, with the estimated state while the camera is off; a reading that :class:`Guards` refuse
         changes nothing of the estimate."""
         before, guards = self._before, self._tests.guards
-        accepted = not self._tests.motors(before, self._sent, seen)
-        if not self.dark:
+        if before is None:
             self._before, self._sent = seen, None
-            self.dark = self._switch_off is None or self._switch_off(seen)
-            if self.dark:
-                self.filter.start(seen.state, seen.fingertip_force, stated(seen))
+            self.filter.start(seen.state, seen.fingertip_force, stated(seen))
             return seen
+        accepted = not self._tests.motors(before, self._sent, seen)
         if accepted:
-            if self._sent is not None and before is not None:
+            if self._sent is not None:
                 self.filter.move(seen.a - before.a, before.fingertip_force)
             self._before, self._sent = seen, None
             if float((seen.q - self.filter.state.q).abs().max()) <= guards.joint_jump:
