@@ -41,7 +41,7 @@ def seen_at(time: float, done: float, off: float = 0.0, pose: float | None = Non
 def watch(unchecked) -> OnTheWay:
     """A path of two pieces; it turns the object by 10 deg about y in the first, which is off the focus."""
     twists = torch.stack([torch.cat([0 * X, 10 * DEG * Y]), torch.zeros(6, dtype=torch.float64)])
-    pieces = tuple(Piece(None, 10 * DEG * X[:2], twist, twist) for twist in twists)
+    pieces = tuple(Piece(None, 10 * DEG * X[:2], twist, twist, None, X) for twist in twists)
     nothing = 0 * X[:2]
     band = Band(0.0, 0.5 * DEG, torch.zeros(6, dtype=torch.float64), None, None)
     decision = Decision(nothing, StopReason.RUNNING, X[:1], twists[0], twists[0], pieces, band=band)
@@ -67,7 +67,7 @@ def test_a_finger_that_keeps_less_than_half_of_what_was_planned_stops_it(uncheck
     """From 4 N to 2 N in the first of two pieces, and back in the second."""
     start, low = (torch.tensor([x, 0.1], dtype=torch.float64) for x in (4.0, 2.0))
     twist = torch.zeros(6, dtype=torch.float64)
-    pieces = tuple(Piece(None, 10 * DEG * X[:2], twist, twist, force) for force in (low, start))
+    pieces = tuple(Piece(None, 10 * DEG * X[:2], twist, twist, force, force) for force in (low, start))
     decision = Decision(0 * X[:2], StopReason.RUNNING, X[:1], twist, twist, pieces)
     watch = OnTheWay(Guards(), seen_at(0.0, 0.0, fingertip_force=start), decision)
     for done, force in ((0.25, 1.6), (0.5, 1.09), (0.75, 1.6), (1.0, 2.1)):

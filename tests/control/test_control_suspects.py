@@ -76,7 +76,7 @@ def test_moment_arms_that_are_not_as_described_are_no_fault_of_a_sensor(held) ->
     way = J_a @ turned
     for arms, blamed in ((1.0, False), (1.3, False), (2.5, True)):
         q, a = seen.q + torch.from_numpy(turned), seen.a + torch.from_numpy(arms * way)
-        assert ("'index_distal'" in watch.motions.suspects(dataclasses.replace(seen, q=q, a=a))) is blamed
+        assert ("'index_distal'" in watch.suspects(dataclasses.replace(seen, q=q, a=a))) is blamed
 
 
 def test_fingertips_that_read_too_little_are_told_until_they_are_known_to(held) -> None:

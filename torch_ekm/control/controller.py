@@ -123,8 +123,7 @@ class LookAndMoveController:
                 deviation = deviation + variance.sqrt()  # g errs alike along a path
             f, both = f.plus(nominal), both.plus(nominal + g)
             lin = one.linearization
-            said = self._of_pads(lin, lin.described_normal_sensitivity @ part, 0.0)
-            said = None if one.said is None else one.said + said
+            said = one.said + self._of_pads(lin, lin.described_normal_sensitivity @ part, 0.0)
             made.append(Piece(lin, w, nominal, nominal + g, one.force, said))
         nominal, increment = made[0].nominal, made[0].increment
         if len(made) > 1:

@@ -99,9 +99,9 @@ class Piece:
     """f(s, w) [rad, m, rad]."""
     increment: Float[Tensor, " n_s"]
     """(f + g)(s, w) [rad, m, rad]."""
-    force: Float[Tensor, " n_pads"] | None = None
+    force: Float[Tensor, " n_pads"] | None
     """Normal forces after it [N]; None: not predicted."""
-    said: Float[Tensor, " n_pads"] | None = None
+    said: Float[Tensor, " n_pads"]
     """Their change by the model alone, without what was learned of it [N]."""
     margin: Float[Tensor, " n_pads"] | None = None
     """``mu_s f_n - |f_t|`` after it, by the model [N]; None: not predicted."""

@@ -313,10 +313,10 @@ class Lessons:
             moved = decision.delta_a
             expected = controller.expect(decision.pieces, self._figures.pulled(moved))
         forces, came = self._knowledge.forces, felt(controller.kinematic.hand, expected, seen, after)
-        said = [one.said for one in expected.pieces if one.said is not None]
-        if said and came is not None and not came.wrong:  # else a finger slid, or a link took its load
+        if came is not None and not came.wrong:  # else a finger slid, or a link took its load
             turned = sum(float(one.increment[-3:].norm()) for one in expected.pieces)
-            forces.update(expected.moved, came.change, torch.stack(said).sum(0), turned)
+            said = torch.stack([one.said for one in expected.pieces]).sum(0)
+            forces.update(expected.moved, came.change, said, turned)
         return self.learn_increment(expected, moved, increment)
 
     def learn_increment(

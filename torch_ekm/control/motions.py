@@ -33,16 +33,11 @@ _R, _E = StopReason, Effect
 
 class MotionTests:
     """Encoders against commands and joints, joints and object against encoders, joints against the object's
-    surface; of one manipulation."""
+    surface."""
 
     def __init__(self, readings: ReadingTests, model: KinematicModel) -> None:
         self.guards, self.readings, self.hand, self.model = readings.guards, readings, model.hand, model
-        self._begun: Observation | None = None
         self._moves = torch.from_numpy(self.hand.joint_upper > self.hand.joint_lower)
-
-    def begin(self, seen: Observation) -> None:
-        """The reading before the first motion."""
-        self._begun = seen
 
     def after(
         self, before: Observation, sent: Tensor, seen: Observation, expected: Expectation
@@ -61,25 +56,21 @@ class MotionTests:
         wrong = -share > _AGAINST and sharp >= self.guards.gate
         return said + against(wrong, StopReason.WRONG_WAY, back, Effect.UNLEARNED, running=2)
 
-    @property
-    def agreed(self) -> bool:
-        """Joints, pads and object did, before the first motion."""
-        return self._begun is not None and self.on_surface(self._begun)
-
-    def suspects(self, seen: Observation) -> str:
-        """Which sensors contradict each other where the model refuses a state."""
+    def suspects(self, seen: Observation, begun: Observation) -> str:
+        """Which sensors contradict each other where the model refuses a state; a manipulation has begun with
+        another reading."""
         away = ", ".join(name for name, gap in self._gaps(seen).items() if gap > _GAP)
         off = f"fingertips press ({away}) where pose and joints have them off its surface (limit "
-        found = "; ".join(filter(None, (self._differs(seen), away and f"{off}{1e3 * _GAP:g} mm)")))
+        found = "; ".join(filter(None, (self._differs(seen, begun), away and f"{off}{1e3 * _GAP:g} mm)")))
         return found and f"{found}: check these sensors, the joints' zero, and the pose"
 
-    def _differs(self, seen: Observation) -> str:
+    def _differs(self, seen: Observation, begun: Observation) -> str:
         """Which encoder and its joints have come apart since the beginning, farther than tendons stretch and
         moment arms that are not as described explain; empty: none."""
         hand = self.hand
         off, way = self._stretch(seen), seen.a.numpy() - hand.actuator_offset
-        if self._begun is not None and not torch.equal(self._begun.a, seen.a):
-            off, way = off - self._stretch(self._begun), (seen.a - self._begun.a).numpy()
+        if not torch.equal(begun.a, seen.a):
+            off, way = off - self._stretch(begun), (seen.a - begun.a).numpy()
         most = NOISE.outlier * NOISE.encoder + NOISE.arm * abs(way)
         i = int((abs(off) - most).argmax())
         if abs(off[i]) <= most[i]:
@@ -138,8 +129,8 @@ class FingertipTests:
     def before(self, decision: Decision, seen: Observation, first: bool) -> list[Objection]:
         """Pads that do not measure press too hard, by the model's estimate; fingers bear less than the object
         needs before it turns for the first time, as measured."""
-        lin, force, said = decision.linearization, seen.fingertip_force, []
-        if first and lin is not None and force is not None and decision.grip is not None:
+        lin, force, said = decision.pieces[0].linearization, seen.fingertip_force, []
+        if first and force is not None and decision.grip is not None:
             rows, _ = self.hand.pad_rows(lin.contacts.finger)
             grip = zip(rows, decision.grip.force.tolist(), decision.grip.least.tolist(), strict=True)
             weak = ", ".join(
@@ -163,9 +154,9 @@ class FingertipTests:
         if seen.dated and before.dated and not (taken > before.time and abs(seen.time - taken) <= most):
             late = f"the fingertips were read at {taken:.3f} s: {_STANDS_IN}"
             return None, [Objection(_R.STALE_SENSOR, late, _E.TOLD)]
-        lin, read = decision.linearization, force.tolist()
+        lin, read = decision.pieces[0].linearization, force.tolist()
         # before the first motion: then no grip by wrong pads has changed the forces
-        torque = lin is not None and any(d.kind is ModelStatus.UNEXPLAINED_TORQUE for d in lin.doubts)
+        torque = any(d.kind is ModelStatus.UNEXPLAINED_TORQUE for d in lin.doubts)
         said = self._scale(seen, force) if self._force is None or torque else []
         expected = self._normal(lin)
         frozen = self._frozen(force, float((seen.a - before.a).abs().max()))
@@ -177,8 +168,9 @@ class FingertipTests:
         high = [i for i, most in enumerate(usual) if i not in faults and read[i] > most]
         alone = self._by_joints(seen) if high else {}
         for i in high:
-            other = alone.get(i)
-            if other is not None and self._contradicts(read[i], other):
+            other = alone.get(i, math.nan)  # which contradicts nothing
+            variance = self._least**2 + _JOINT_STD**2 + (NOISE.force_share * other) ** 2
+            if (read[i] - other) ** 2 > self.guards.gate**2 * variance:
                 faults[i] = f"reads {read[i]:.2f} N, joints and springs give {other:.2f} N"
             else:
                 said += self._ceiling(i, read[i], "as measured")
@@ -236,12 +228,8 @@ class FingertipTests:
         except GraspError:
             return {}
 
-    def _normal(self, lin: Linearization | None) -> dict[int, float]:
-        if lin is None or not lin.forces.solved:
+    def _normal(self, lin: Linearization) -> dict[int, float]:
+        if not lin.forces.solved:
             return {}
         rows, pads = self.hand.pad_rows(lin.contacts.finger)
         return dict(zip(pads, lin.forces.normal[rows].tolist(), strict=True))
-
-    def _contradicts(self, force: float, expected: float) -> bool:
-        variance = self._least**2 + _JOINT_STD**2 + (NOISE.force_share * expected) ** 2
-        return (force - expected) ** 2 > self.guards.gate**2 * variance

@@ -114,7 +114,7 @@ class Bands:
 
     def _of_forces(self, piece: Piece) -> tuple[Tensor | None, Tensor | None]:
         """Forces of the pads that touched at the start and their deviations; None: not measured."""
-        if self._force is None or piece.force is None or piece.said is None:
+        if self._force is None or piece.force is None:
             return None, None
         rows, pads = self._controller.kinematic.hand.pad_rows(piece.linearization.contacts.finger)
         self._pads = pads if self._pads is None else self._pads

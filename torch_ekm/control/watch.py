@@ -78,7 +78,7 @@ class Watch:
                 break
             seen = look()
         self.readings.follow(None, seen)
-        self.motions.begin(seen)
+        self._begun = seen
         self._undated = "" if seen.dated else _UNDATED
         self.blind = int(seen.status is PlantStatus.NOT_SEEN)
         return seen, doubt
@@ -185,8 +185,8 @@ class Watch:
     def suspects(self, seen: Observation) -> str:
         """Which sensors contradict each other where the model refuses a state; nothing is learned of the
         manipulation if the joints and the object agreed at first."""
-        said = self.motions.suspects(seen)
-        if said and self.motions.agreed:
+        said = self.motions.suspects(seen, self._begun)
+        if said and self.motions.on_surface(self._begun):
             self.lie = said
         return said
 
