@@ -202,7 +202,7 @@ class Rehearsal:
         self.first: Decision | None = None
         """The first one, with the grip before anything moves."""
         self.last: Decision | None = None
-        self._too_long, self._most = False, math.inf
+        self._too_long, self._most = False, math.inf  # the hardest grip [N]
 
     @torch.no_grad()
     def path(self) -> Iterator[Waypoint]:
@@ -216,13 +216,16 @@ class Rehearsal:
             if lin is None:
                 return
             force = controller.believed(here.a, here.fingertip_force if self._measures else None)
+            share = _GRIPPED
             if self.first is None:
-                self._most = self._bears(lin)
+                share = min(share, self._firm)
+                if softened(hand.kinematic, lin):  # by its forces: with more it would buckle
+                    self._most = float(lin.forces.normal.max())
             lin = controller.corrected(lin)
             self.last = decision = self._decide(here, force, lin)
-            begins, self.first = self.first is None, self.first or decision
-            firm = _gripped(decision) or (begins and not is_loose(decision, self._firm))
-            if decision.status is not StopReason.RUNNING or (self._target is None and firm):
+            self.first = self.first or decision
+            firm = self._target is None and not is_loose(decision, share)
+            if decision.status is not StopReason.RUNNING or firm:
                 return
             way = way + decision.delta_a
             self._too_long = float(way.abs().max()) > self._longest
@@ -257,11 +260,6 @@ class Rehearsal:
         again = dataclasses.replace(lin, manipulation_jacobian=J)
         return controller.choose(again, dataclasses.replace(seen, bend=rest))
 
-    def _bears(self, lin: Linearization) -> float:
-        """The hardest grip [N]: the present one where its forces have made the grasp soft; with more it would
-        buckle."""
-        return float(lin.forces.normal.max()) if softened(self.hand.kinematic, lin) else math.inf
-
     def _there(self, state: GraspState) -> bool:
         return self._target is not None and self._controller.focus.error(self._target, state) <= _THERE
 
@@ -292,15 +290,10 @@ class Rehearsal:
         return End(PathEnd.FRICTION, (), said or "the object comes no nearer")
 
 
-def _gripped(decision: Decision) -> bool:
-    grip = decision.grip
-    return grip is None or (float(grip.force.max()) >= _GRIPPED * grip.wanted and not grip.weak)
-
-
-def is_loose(decision: Decision, firm: float) -> bool:
+def is_loose(decision: Decision, share: float) -> bool:
     """The grip before anything moves is less than that share of what is wanted, or a finger's is weak."""
     grip = decision.grip
-    return grip is not None and (grip.weak or float(grip.force.max()) < firm * grip.wanted)
+    return grip is not None and (grip.weak or float(grip.force.max()) < share * grip.wanted)
 
 
 def _bearing(hand: ModelHand) -> list[str]:
