@@ -251,15 +251,15 @@ class LookAndMoveController:
             with contextlib.suppress(GraspError):
                 forces = self.kinematic.linearize(lin.state, lin.contacts).forces
                 alone = forces.normal if forces.solved else None
-        seen = Situation(
-            hand, self.focus, lin.state, a, force, error, desired, alone, self._weight, self.tighter
-        )
+        drift = None
         if self.forces is not None:
             rows, pads = hand.pad_rows(lin.contacts.finger)
             drift = np.zeros(len(lin.contacts.finger))
             way = (self.focus.matrix.mT @ desired)[3:].norm()
             drift[rows] = as_array(way * self.forces.by_way[pads])
-            seen = dataclasses.replace(seen, drift=drift)
+        seen = Situation(
+            hand, self.focus, lin.state, a, force, error, desired, alone, self._weight, self.tighter, drift
+        )
         return seen if self._wanted is None else dataclasses.replace(seen, grip=self._wanted(lin, seen))
 
     def choose(self, lin: Linearization, seen: Situation) -> Decision:

@@ -270,6 +270,9 @@ class HandFigures(ParameterFilter):
             lin: of the state before it.
             moved: w, what the encoders did [rad]; before :meth:`commit`.
             increment: ds, as measured.
+
+        Raises:
+            ShapeError, NonFiniteError: nothing is changed.
         """
         check_kind("lin", lin, Linearization, "a Linearization, e.g. model.linearize(state)")
         check_shape("moved", moved, lin.manipulation_jacobian[0].shape, "of the motors")
@@ -302,15 +305,8 @@ class HandFigures(ParameterFilter):
         Returns:
             z of the filter; None: the movement cannot be modelled, went against its prediction, or nothing
                 moved.
-
-        Raises:
-            ShapeError, NonFiniteError: nothing is changed.
         """
         first = path[0][0]
-        for name, value, like in (("moved", moved, first.manipulation_jacobian[0]),
-                                  ("off", off, first.manipulation_jacobian[:, 0])):  # fmt: skip
-            check_shape(name, value, like.shape, "of the motors" if name == "moved" else "")
-            check_finite(name, value)
         if first.equations is None or not bool(moved.any()):
             return None
         joints = first.equations.moving.nonzero()[:, 0].tolist()
