@@ -122,9 +122,7 @@ class ClosedLoop:
             self._gate.command(torch.zeros(self.controller.kinematic.hand.n_a), by="hold")
 
     def plan(self, target: PoseTarget) -> Plan:
-        """The path to ``target`` from here, how sure the model is of it, and how far it is safe. ::
-
-            print(loop.plan(target))
+        """The path to ``target`` from here, how sure the model is of it, and how far it is safe.
 
         Nothing moves, and nothing is learned.
         """

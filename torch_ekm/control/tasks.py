@@ -151,8 +151,7 @@ class EffortTask:
         return Squares(np.eye(n_a), np.zeros(n_a), self.weight, DEGREE)
 
 
-#: What a step should do by default: effort, off-axis motion, grip force, focus. The figures suit the iCub
-#: hand.
+#: What a step should do by default; the figures suit the iCub hand.
 DEFAULT_TASKS: tuple[Task, ...] = (EffortTask(), OffAxisTask(), GripForceTask(), FocusTask())
 
 
