@@ -102,10 +102,11 @@ class Bands:
             _, variance = controller.enhanced.correction(piece.state, piece.action, state.n_s)
             self._g += variance[-6:].sqrt().numpy()
             covariance += np.diag(self._g**2)
-            slopes = figures.twist_slopes(piece.linearization, piece.action)
-            if slopes is not None and isinstance(figures, HandFigures):
-                self._slopes = slopes if self._slopes is None else self._slopes + slopes
-                covariance += self._slopes @ figures.covariance.numpy() @ self._slopes.T
+            if isinstance(figures, HandFigures):
+                slopes = figures.twist_slopes(piece.linearization, piece.action)
+                if slopes is not None:
+                    self._slopes = slopes if self._slopes is None else self._slopes + slopes
+                    covariance += self._slopes @ figures.covariance.numpy() @ self._slopes.T
         rows = focus.off_matrix[~focus.off_translation].numpy()
         spread = np.linalg.eigvalsh(rows @ covariance @ rows.T).max(initial=0.0)
         off = focus.off_rotation(self._target.error(state))

@@ -84,9 +84,6 @@ class DescribedFigures(Recorded, nn.Module):
     ) -> None:
         """Does nothing."""
 
-    def twist_slopes(self, lin: Linearization, pull: Tensor) -> None:
-        """Nothing is unsure."""
-
     def begin(self, a: Tensor) -> None:
         """There is no play."""
 

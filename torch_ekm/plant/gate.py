@@ -231,13 +231,13 @@ class Gate(PlantWrapper):
                 name = self._hand.actuator_names[i]
                 self._refuse(f"actuator '{name}'", by, asked, allowed.format(*ends))
 
-    def _budget(self, start: Observation | None) -> float:
+    def _budget(self, start: Observation) -> float:
         """How far a command may go by the rate [rad]; a clock that goes back was set anew."""
-        if start is None or not start.dated or start.time < self._since:
+        if not start.dated or start.time < self._since:
             self._left = self.increment
         else:
             self._left = min(self.increment, self._left + self.speed * (start.time - self._since))
-        self._since = math.inf if start is None else start.time
+        self._since = start.time
         return self._left
 
     def _refuse(self, what: str, by: str, asked: str, allowed: str) -> NoReturn:

@@ -107,7 +107,8 @@ class ServoInverse(PlantWrapper):
         return self.gate.follow(sent, look, start, by)
 
     def _inverse(self, waypoints: Tensor, start: Observation) -> tuple[Tensor, Tensor]:
-        """Set-points for the waypoints ``(n, n_a)``, and the sign of each motor's last motion, 0: none."""
+        """Set-points for the waypoints ``(n, n_a)``, cut where they lie out of range and never turned round,
+        and the sign of each motor's last motion, 0: none."""
         sent, sign, moved = [torch.zeros_like(waypoints[0])], torch.zeros_like(waypoints[0]), waypoints[0] * 0
         for w, piece in zip(waypoints, waypoints.diff(dim=0, prepend=waypoints[:1] * 0), strict=True):
             moves = (w - moved).abs() > self.servo.resolution
@@ -115,18 +116,13 @@ class ServoInverse(PlantWrapper):
             added = (self.servo.command(sign) - sign).clamp(-self.servo.largest, self.servo.largest)
             most = piece.abs().clamp(min=self.gate.increment)
             sent.append(sent[-1] + (torch.where(sign != 0, w + added, 0.0) - sent[-1]).clamp(-most, most))
-        return torch.stack([self._within_range(start.a, v) for v in sent[1:]]), sign
+        lower, upper = (edge - start.a for edge in self._range)
+        return torch.stack(sent[1:]).clamp(lower.clamp(max=0.0), upper.clamp(min=0.0)), sign
 
     def learn(self, after: Observation) -> None:
         """An accepted reading after the last motion."""
         start, v = self._start, self.sent[-1]
         self.servo.update(v, after.a - start, self._known & self._free(start, v, after.a))
-
-    def _within_range(self, a: Tensor, v: Tensor) -> Tensor:
-        """v, cut where ``a + v`` would lie outside; it is never turned round."""
-        lower, upper = self._range
-        up, down = (upper - a).clamp(min=0.0), (lower - a).clamp(max=0.0)
-        return v.clamp(down, up)
 
     def _free(self, start: Tensor, v: Tensor, end: Tensor) -> Tensor:
         """Motions that no end of the range cut short, nor brought back into it: an end is not a dead zone."""
