@@ -77,12 +77,7 @@ class ModelError(Recorded, nn.Module):
         self.tighter.copy_((self.tighter + (_LOSS if lost else _SLIP)).clamp(max=_MOST))
 
     def see(self, error: Float[Tensor, " 3"], way: Float[Tensor, " 3"]) -> None:
-        """Learn from one movement.
-
-        Args:
-            error: e, measured less predicted [rad].
-            way: predicted rotation [rad].
-        """
+        """Learn from one movement: e, measured less predicted, and the predicted rotation [rad]."""
         size = float(torch.linalg.vector_norm(way))
         if size == 0:
             return

@@ -78,12 +78,8 @@ class Situation:
 
 
 def grip_shares(f_n: Array, grip: float) -> Array:
-    """What is wanted of each finger ``(n_c,)`` [N]: the one that presses most opposes all that share.
-
-    Args:
-        f_n: normal forces [N].
-        grip: of the finger that opposes the others [N].
-    """
+    """What is wanted of each finger ``(n_c,)`` [N]: the one that presses most, with ``grip``, opposes all
+    that share."""
     wanted = np.full(len(f_n), grip / max(len(f_n) - 1, 1))
     wanted[f_n.argmax()] = grip
     return wanted

@@ -67,25 +67,15 @@ class PoseFilter:
         return self.covariance[-6:, -6:]
 
     def start(self, seen: GraspState, force: Tensor | None, pose_covariance: Tensor | None) -> None:
-        """Begin with what camera, joints and fingertips say.
-
-        Args:
-            seen: joints and pose as measured.
-            force: normal force of each pad ``(n_pads,)`` [N]; None: the pads near the object touch it.
-            pose_covariance: of the pose's error twist [m, rad]; None or NaN: 0.3 mm and 0.3 deg.
-        """
+        """Begin with what camera, joints and fingertips say: without forces ``(n_pads,)`` [N] the pads near
+        the object touch it, without a covariance of the pose's error twist it is 0.3 mm and 0.3 deg."""
         joints = NOISE.joint**2 * torch.eye(seen.q.shape[-1], dtype=seen.q.dtype)
         P = torch.block_diag(joints, _seen_covariance(pose_covariance, seen.q))
         self.state, self.covariance, self._last = seen, self._permitted(P), None
         self._update(None, force)
 
     def move(self, moved: Float[Tensor, " n_a"], force: Tensor | None) -> None:
-        """Carry the state along with a motion.
-
-        Args:
-            moved: w, of the encoders [rad].
-            force: normal force of each pad before it ``(n_pads,)`` [N].
-        """
+        """Carry the state along with a motion of the encoders [rad]; ``force`` of each pad before it [N]."""
         if self.kinematic.figures is not None:
             moved = self.kinematic.figures.pulled(moved)
         ds, Q = self._predicted(moved, force)
