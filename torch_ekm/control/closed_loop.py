@@ -38,7 +38,7 @@ class ClosedLoop:
     ``steps`` is a generator of movements; metrics and pictures are its consumers::
 
         with ClosedLoop(plant, controller) as loop:
-            print(loop.plan(target))
+            print(loop.reach(), loop.plan(target))
             for step in loop.steps(target):
                 print(step.increment)
 
@@ -55,8 +55,7 @@ class ClosedLoop:
         knowledge: of the hand, on which the loop goes on learning; None: nothing is known yet, and nothing is
             learned of the servos if the controller's model is no enhanced one.
         safety: when it looks again and stops.
-        planner: decides on the movements; None: :class:`WholeTurn` of an enhanced model, else
-            :class:`OneStep`.
+        planner: decides on movements; None: :class:`WholeTurn` of an enhanced model, else :class:`OneStep`.
         learn: False leaves the learner as it is.
         decline: a target that the motors do not reach, to first order, ends before anything moves.
 
@@ -132,10 +131,7 @@ class ClosedLoop:
 
     def reach(self, *, sign: int = 1, limit: float = math.radians(90)) -> Reach:
         """``max |angle|`` of a :meth:`plan` about the focused axis: how far the model turns the object, and
-        what ends it. Nothing moves, and nothing is learned. ::
-
-            reach = loop.reach()
-            loop.run(PoseTarget.turned(plant.observe().state, axis, reach.safe))
+        what ends it. Nothing moves, and nothing is learned.
 
         Args:
             sign: 1 or -1, which way about the controller's focus.
@@ -153,8 +149,7 @@ class ClosedLoop:
         Raises:
             PlantInUseError: another loop, or this one in another thread, commands the plant.
             StateError: another loop has given the controller other knowledge.
-            EKMError: see :meth:`LookAndMoveController.decide`, and what the plant raises before there is a
-                reading.
+            EKMError: see :meth:`LookAndMoveController.decide`; what the plant raises before it has read.
         """
         return Manipulation.of(target, self.controller.focus, self.steps(target))
 
