@@ -77,6 +77,6 @@ class _NothingIsKnown(dict):
 @pytest.fixture
 def planned_anew(monkeypatch: pytest.MonkeyPatch) -> None:
     """No pinch comes from an earlier grasp: the test compares a run with its repetition."""
-    from torch_ekm.simulation.grasp_planning import remembered
+    from torch_ekm.simulation.grasp_planning import pinch
 
-    monkeypatch.setattr(remembered, "_plans", _NothingIsKnown())
+    monkeypatch.setattr(pinch, "_plans", _NothingIsKnown())

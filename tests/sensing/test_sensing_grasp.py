@@ -16,7 +16,7 @@ from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, TrackStatus
 from torch_ekm.simulation import HallSensors, SensedPlant
-from torch_ekm.simulation.imaging.grasp_view import camera_facing, grasp_scene
+from torch_ekm.simulation.imaging.card_scene import camera_facing, grasp_scene
 from torch_ekm.simulation.sensed_plant import ICUB_PALM_MOUNT
 
 DEG = np.pi / 180

@@ -12,7 +12,7 @@ import pytest
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.simulation import PlantParameters, SimulatedHand
 from torch_ekm.simulation.mechanism.assembly import make_transmission
-from torch_ekm.simulation.mechanism.departures import CableLosses, JointShape
+from torch_ekm.simulation.mechanism.joint_shape import JointShape
 from torch_ekm.simulation.mechanism.transmission import Transmission, coupled_posture
 from torch_ekm.simulation.sensors import Sensors
 
@@ -20,22 +20,22 @@ HAND = load_hand("icub_right")
 N_Q, STIFFNESS = HAND.n_q, 4.0
 ARMED = np.flatnonzero(HAND.actuation_jacobian.any(axis=0))
 TENDON = np.array([actuator.tendon for actuator in HAND.actuators])
-ROUND, NO_LOSSES = JointShape(np.zeros(N_Q), np.zeros(N_Q), 0.0), CableLosses(0.0, 0.0, 0.0, np.zeros(N_Q))
+ROUND, NO_PLAY = JointShape(np.zeros(N_Q), np.zeros(N_Q), 0.0), np.zeros(N_Q)
 
 
 def make(
     shape: JointShape = ROUND,
-    losses: CableLosses = NO_LOSSES,
+    play: np.ndarray = NO_PLAY,
     *,
+    losses: PlantParameters = PlantParameters(),  # noqa: B008
     hand: HandDescription = HAND,
     stiffness: float = STIFFNESS,
     friction: float = 0.0,
-    creep: float = 0.0,
     **changes: Any,
 ) -> Transmission:
     actuators = tuple(dataclasses.replace(actuator, stiffness=stiffness) for actuator in hand.actuators)
     changes |= {"actuators": actuators, "joint_friction": np.full(N_Q, friction)}
-    return Transmission(dataclasses.replace(hand, **changes), creep, shape, losses)
+    return Transmission(dataclasses.replace(hand, **changes), losses, shape, play)
 
 
 def flexed(seed: int = 0) -> np.ndarray:
@@ -59,7 +59,7 @@ def test_the_drives_give_the_gradient_of_the_energy_of_odd_pulleys_springs_and_c
     draw = np.random.default_rng(1)
     shape = JointShape(np.where(free, 0.0, 0.25), draw.uniform(-3, 3, N_Q), 0.5)
     coupling = 0.2
-    transmission = make(shape, dataclasses.replace(NO_LOSSES, coupling=coupling))
+    transmission = make(shape, losses=PlantParameters(tendon_coupling=coupling))
     S, q = coupled_posture(HAND.coupling), flexed()
     motor = taut(transmission, q)
     compliance = (np.eye(HAND.n_a) * (1 - coupling) + coupling) / STIFFNESS
@@ -83,7 +83,7 @@ def test_the_drives_give_the_gradient_of_the_energy_of_odd_pulleys_springs_and_c
 
 
 def test_a_slack_tendon_neither_pushes_nor_shares_its_slack() -> None:
-    transmission = make(losses=dataclasses.replace(NO_LOSSES, coupling=0.2))
+    transmission = make(losses=PlantParameters(tendon_coupling=0.2))
     q = flexed()
     motor = taut(transmission, q, 0.05)
     pulling = np.flatnonzero(TENDON)
@@ -97,7 +97,7 @@ def test_a_slack_tendon_neither_pushes_nor_shares_its_slack() -> None:
 
 
 def test_hysteresis_holds_a_share_of_the_pull_against_either_direction() -> None:
-    transmission = make(losses=dataclasses.replace(NO_LOSSES, hysteresis=0.1))
+    transmission = make(losses=PlantParameters(hysteresis=0.1))
     q, plain = flexed(), make()
     held = []
     for by in (0.05, 0.2, 0.2):  # from below, then from above
@@ -109,7 +109,7 @@ def test_hysteresis_holds_a_share_of_the_pull_against_either_direction() -> None
 
 
 def test_cable_friction_is_a_share_of_what_the_cables_turn_a_joint_with() -> None:
-    transmission = make(losses=dataclasses.replace(NO_LOSSES, capstan=0.1))
+    transmission = make(losses=PlantParameters(cable_friction=0.1))
     q = flexed()
     motor = taut(transmission, q)
     cables = STIFFNESS * 0.1 * (HAND.actuation_jacobian.sum(axis=0) @ coupled_posture(HAND.coupling))
@@ -124,7 +124,7 @@ def test_no_torque_goes_through_a_joint_within_its_play() -> None:
     play = np.zeros(N_Q)
     joint = HAND.joint_names.index("index_2")
     play[joint] = 0.06
-    transmission, plain = make(losses=CableLosses(0.0, 0.0, 0.0, play)), make()
+    transmission, plain = make(play=play), make()
     q = flexed()
     motor = taut(plain, q, 0.0)
     balanced = q.copy()
@@ -149,8 +149,8 @@ def test_each_hardware_instance_has_its_own_shapes_and_play() -> None:
     np.testing.assert_array_equal(one.shape.phase, same.shape.phase)
     assert (one.shape.phase != other.shape.phase).all()
     coupled = HAND.coupling.reshape(-1, N_Q).any(axis=0)
-    assert (one.losses.play > 0).sum() == 3  # ring and little finger have couplings only
-    assert not one.losses.play[coupled].any()
+    assert (one.play > 0).sum() == 3  # ring and little finger have couplings only
+    assert not one.play[coupled].any()
     assert (one.shape.variation[coupled] == 0).all()
     assert (one.shape.variation[~coupled] == 0.25).all()
 
@@ -267,7 +267,7 @@ def test_lengthened_tendons_slacken_and_cables_do_not():
 
 
 def test_creep_follows_the_load():
-    transmission, q = make(creep=0.01), flexed(4)
+    transmission, q = make(losses=PlantParameters(tendon_creep=0.01)), flexed(4)
     transmission.age(q, taut(transmission, q), duration=5.0)
     grown = transmission.offset - HAND.actuator_offset
     np.testing.assert_allclose(grown, 0.01 * 5.0 * 0.4 * TENDON, atol=1e-9)

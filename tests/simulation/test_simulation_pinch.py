@@ -16,16 +16,16 @@ from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
-from torch_ekm.simulation.grasp_planning import pinch, remembered
+from torch_ekm.simulation.grasp_planning import pinch
 from torch_ekm.simulation.grasp_planning.pinch import (
     _guesses,
     opposing_pads,
     pinch_problem,
     plan_pinch,
+    remembered_pinch,
     turning_axis,
 )
 from torch_ekm.simulation.grasp_planning.pinch_problem import PinchRequest
-from torch_ekm.simulation.grasp_planning.remembered import remembered_pinch
 from torch_ekm.simulation.mechanism.assembly import make_transmission
 
 G = 9.81
@@ -214,8 +214,8 @@ def test_an_object_that_no_pinch_holds_is_refused_once(tmp_path, monkeypatch):
 def test_a_known_pinch_is_that_which_would_be_planned(monkeypatch):
     wanted, planned, plan = PinchRequest(along=0.004), [], pinch.plan_pinch
     anew = plan(with_range(0.0, 150 * DEG), wanted)
-    monkeypatch.setattr(remembered, "_plans", {})
-    monkeypatch.setattr(remembered, "plan_pinch", lambda *what: planned.append(1) or plan(*what))
+    monkeypatch.setattr(pinch, "_plans", {})
+    monkeypatch.setattr(pinch, "plan_pinch", lambda *what: planned.append(1) or plan(*what))
     first = remembered_pinch(with_range(0.0, 150 * DEG), wanted)
     for values in vars(first).values():
         if isinstance(values, np.ndarray):
@@ -227,24 +227,10 @@ def test_a_known_pinch_is_that_which_would_be_planned(monkeypatch):
     remembered_pinch(with_range(0.0, 150 * DEG), PinchRequest(along=0.005))
     remembered_pinch(with_range(0.0, 149 * DEG), wanted)
     assert len(planned) == 3
-    monkeypatch.setattr(remembered, "_MOST", 3)
+    monkeypatch.setattr(pinch, "_MOST_PLANS", 3)
     remembered_pinch(with_range(0.0, 148 * DEG), wanted)  # takes the place of the oldest
     remembered_pinch(with_range(0.0, 150 * DEG), wanted)
     assert len(planned) == 5
-
-
-@pytest.mark.parametrize("away", [0.0, 1.0])
-def test_parts_that_are_clear_of_the_object_are_not_asked_for_a_derivative(away):
-    """The same Jacobian as with all of them, near the object and 1 m off."""
-    hand, obj, request = load_hand("icub_right"), load_object("can"), PinchRequest()
-    problem = pinch_problem(hand, obj, PlantConfig(), PlantParameters())
-    x = next(_guesses(problem, request))
-    x[len(problem.moving)] += away
-    clearance, steps = problem.geometry(x[None]).clearance, 1e-6 * np.eye(len(x))
-    assert (clearance < 0.002).any() == (away == 0)
-    values = problem.residuals(np.concatenate([x + steps, x - steps]), request, True)
-    expected = (values[: len(x)] - values[len(x) :]).T / 2e-6
-    np.testing.assert_array_equal(problem.jacobian(x, request, True), expected)
 
 
 def test_planning_takes_one_thread_and_gives_the_others_back(monkeypatch):

@@ -108,7 +108,7 @@ class TomlTable:
         value = self._get(key, default)
         if value is default and key not in self.data:
             return float(default)
-        value = self._finite(key, value)
+        value = self.finite(key, value)
         if value < minimum or (positive and value <= 0):
             valid = "positive" if positive else f"at least {minimum:g}"
             raise self.error(f"'{key}' must be {valid}, got {value:g}")
@@ -128,10 +128,13 @@ class TomlTable:
         return self.number(key, default)
 
     def vector(self, key: str, size: int, default: Any = _NOTHING) -> tuple[float, ...]:
-        value = self._get(key, default)
+        return self.numbers(key, self._get(key, default), size)
+
+    def numbers(self, key: str, value: Any, size: int) -> tuple[float, ...]:
+        """``value``, which stands somewhere under ``key``."""
         if not isinstance(value, list | tuple) or len(value) != size:
             raise self.error(f"'{key}' must be a list of {size} numbers, got {_shown(value)}")
-        return tuple(self._finite(key, entry) for entry in value)
+        return tuple(self.finite(key, entry) for entry in value)
 
     def angles(self, key: str, size: int, default: Any = _NOTHING) -> tuple[float, ...]:
         """A list of angles under ``key`` [rad] or ``key_deg`` [deg], in rad."""
@@ -139,12 +142,15 @@ class TomlTable:
             return tuple(math.radians(value) for value in self.vector(f"{key}_deg", size))
         return self.vector(key, size, default)
 
-    def weights(self, key: str) -> dict[str, float]:
-        """A table of numbers, e.g. moment arms by joint name; not empty."""
+    def weights(self, key: str, other: tuple[type, ...] = ()) -> dict[str, Any]:
+        """A table of numbers, e.g. moment arms by joint name, or of ``other`` types; not empty."""
         value = self._get(key, _NOTHING)
         if not isinstance(value, dict) or not value:
             raise self.error(f"'{key}' must be a table of joint = number, got {_shown(value)}")
-        return {name: self._finite(f"{key}.{name}", entry) for name, entry in value.items()}
+        return {
+            name: entry if isinstance(entry, other) else self.finite(f"{key}.{name}", entry)
+            for name, entry in value.items()
+        }
 
     def _in_degrees(self, key: str) -> bool:
         both = [k for k in (key, f"{key}_deg") if k in self.data]
@@ -152,7 +158,7 @@ class TomlTable:
             raise self.error(f"give either '{key}' [rad] or '{key}_deg', not both")
         return both == [f"{key}_deg"]
 
-    def _finite(self, key: str, value: Any) -> float:
+    def finite(self, key: str, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise self.error(f"'{key}' must be a finite number, got {_shown(value)}")
         if abs(value) > LARGEST_FIGURE:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from .._extras import require
 from ..exceptions import JointMismatchError
 from ..typing import Array
 from ._toml import TomlTable
-from .connected import PinnedPoints
 from .lengths import ArmFunction, Lengths, Loops, Routed, TendonSprings, typical_arms
 from .mjcf_hand import MjcfHand
 from .mjcf_tendons import RoutedTendons, element_name
@@ -22,6 +22,7 @@ LOOP = ("name", "moment_arms", "mjcf_tendons", "value", "links", "points")
 _TABLE = ("angle", "angle_deg", "arm")
 _MOST = 6  # powers of a polynomial
 _POSTURES = 8  # at which the directions of a loop are looked for
+_LEAST = 1e-9  # [m/rad] of an arm of pinned points: a smaller one is rounding
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,10 @@ class LengthReader:
         for table in tables:
             slack = table.data.get("slack", 0.0)
             low, high = slack if isinstance(slack, list) and len(slack) == 2 else (slack, slack)
-            ends.append((self._end(table, low, -np.inf), self._end(table, high, np.inf)))
+            # TOML's inf: no end on this side
+            ends.append(
+                [x if x == none else table.finite("slack", x) for x, none in ((low, -np.inf), (high, np.inf))]
+            )
             if not ends[-1][0] <= ends[-1][1]:
                 raise table.error(f"'slack' reversed: {slack}")
         low, high = np.array(ends).reshape(-1, 2).T
@@ -109,39 +113,29 @@ class LengthReader:
             values += [table.number("value", 0.0)] * count
         return Loops(tuple(names), self.lengths(tables), np.array(values))
 
-    def _arms(self, table: TomlTable, row: Array) -> Iterable[tuple[int, ArmFunction]]:
+    def _arms(self, table: TomlTable, row: Array) -> Iterator[tuple[int, ArmFunction]]:
         """Fills in the constant or typical arms of a row; those that are functions."""
-        data = table.data["moment_arms"]
-        constant = isinstance(data, dict) and {
-            k: v for k, v in data.items() if not isinstance(v, dict | list)
-        }
-        if not isinstance(data, dict) or len(constant or ()) == len(data):
-            constant = table.weights("moment_arms")
-        unexpected = [name for name in (data if isinstance(data, dict) else ()) if name not in self.names]
-        if unexpected:
+        arms = table.weights("moment_arms", (dict, list))
+        if unexpected := [name for name in arms if name not in self.names]:
             raise JointMismatchError(table.path, (), unexpected, self.names)
         low, high = self._limits
-        found = []
-        for name, value in data.items():
+        for name, value in arms.items():
             joint = self.names.index(name)
-            if not isinstance(value, dict | list):
-                row[joint] = TomlTable(table.path, table.place, {name: value}, (name,)).number(name)
+            if isinstance(value, float):
+                row[joint] = value
                 continue
             function = self._function(table, name, value)
             row[joint] = function.typical(low[joint], high[joint])
             if row[joint] == 0:
                 raise table.error(f"the moment arm of '{name}' is 0 all over its range")
-            found.append((joint, function))
-        return found
+            yield joint, function
 
     def _function(self, table: TomlTable, name: str, value: Any) -> ArmFunction:
-        place = f"{table.place}: moment arm of '{name}'"
         if isinstance(value, list):
-            one = TomlTable(table.path, place, {"polynomial": value}, ("polynomial",))
             if not 1 <= len(value) <= _MOST:
-                raise one.error(f"a polynomial has 1 to {_MOST} coefficients, got {len(value)}")
-            return ArmFunction.polynomial(one.vector("polynomial", len(value)))
-        one = TomlTable(table.path, place, value, _TABLE)
+                raise table.error(f"{name}: a polynomial has 1 to {_MOST} coefficients, got {len(value)}")
+            return ArmFunction.polynomial(table.numbers(f"moment_arms.{name}", value, len(value)))
+        one = TomlTable(table.path, f"{table.place}: moment arm of '{name}'", value, _TABLE)
         arms = one.data.get("arm")
         n = len(arms) if isinstance(arms, list) else 2
         angle, arm = one.angles("angle", n), one.vector("arm", n)
@@ -168,9 +162,7 @@ class LengthReader:
             raise table.error(f"'links' must be two of {', '.join(known)}")
         if not isinstance(points, list) or len(points) != 2:
             raise table.error("'points' must be two points, one in the frame of each link")
-        at = [
-            TomlTable(table.path, table.place, {"points": p}, ("points",)).vector("points", 3) for p in points
-        ]
+        at = [table.numbers("points", point, 3) for point in points]
         low, high = self._limits
         postures = np.random.default_rng(0).uniform(low, high, size=(_POSTURES, len(low)))
         pins = PinnedPoints(self.urdf, links, at, self.names, postures)
@@ -178,8 +170,59 @@ class LengthReader:
             raise table.error("no joint moves these points apart")
         return pins
 
-    @staticmethod
-    def _end(table: TomlTable, value: Any, none: float) -> float:
-        if value == none:  # TOML's inf: no end on this side
-            return none
-        return TomlTable(table.path, table.place, {"slack": value}, ("slack",)).number("slack")
+
+class PinnedPoints:
+    """``c(q) = U^T (p_1(q) - p_2(q))`` [m], U the directions in which the points can part at all.
+
+    Args:
+        urdf: the tree.
+        links: the two.
+        points: of each in its own frame [m].
+        names: of all joints, in the order of q.
+        postures: at which directions are looked for ``(n, n_q)`` [rad].
+    """
+
+    def __init__(
+        self,
+        urdf: UrdfModel,
+        links: Sequence[str],
+        points: Sequence[Sequence[float]],
+        names: Sequence[str],
+        postures: Array,
+    ) -> None:
+        self._chains = []
+        for link, point in zip(links, points, strict=True):
+            parts = [
+                (joint.transform, None if joint.name not in names else names.index(joint.name), joint.axis)
+                for joint in urdf.joints_to(link)
+            ]
+            self._chains.append((parts, np.array(point, dtype=np.float64)))
+        self._n_q = len(names)
+        self._directions = np.eye(3)
+        rows = np.concatenate([self(q)[1].T for q in postures])
+        _, size, directions = np.linalg.svd(rows, full_matrices=False)
+        self._directions = directions[size > _LEAST * np.sqrt(len(postures))]
+
+    @property
+    def count(self) -> int:
+        """How many conditions there are."""
+        return len(self._directions)
+
+    def __call__(self, q: Array) -> tuple[Array, Array]:
+        (first, J), (second, K) = (self._point(parts, point, q) for parts, point in self._chains)
+        return self._directions @ (first - second), self._directions @ (J - K)
+
+    def _point(
+        self, chain: list[tuple[Array, int | None, Array]], point: Array, q: Array
+    ) -> tuple[Array, Array]:
+        """Where a point is [m], and its Jacobian ``(3, n_q)``, in the root's frame."""
+        R, o, joints = np.eye(3), np.zeros(3), []
+        for transform, joint, axis in chain:
+            o, R = o + R @ transform[:3, 3], R @ transform[:3, :3]
+            if joint is not None:
+                joints.append((joint, R @ axis, o))
+                R = R @ require("scipy.spatial.transform").Rotation.from_rotvec(q[joint] * axis).as_matrix()
+        at, J = o + R @ point, np.zeros((3, self._n_q))
+        for joint, axis, origin in joints:
+            J[:, joint] += np.cross(axis, at - origin)
+        return at, J

@@ -42,7 +42,7 @@ def compile_mjcf(path: Path) -> tuple[Any, set[str], list[str]]:
             it says.
         MissingExtraError: mujoco is not installed.
     """
-    reader = _read(path)
+    reader = _Reader(path)
     root = reader.root
     strict = ET.Element("mujoco", model=root.get("model", path.stem))
     ET.SubElement(strict, "compiler", _BOUNDS)
@@ -90,17 +90,7 @@ def mjcf_files(path: Path) -> list[Path]:
     Raises:
         DescriptionError: as :func:`compile_mjcf`, of the files alone.
     """
-    return _read(path).files
-
-
-def _read(path: Path) -> _Reader:
-    """All files, each in the place of its ``<include>``."""
-    reader = _Reader(path)
-    try:
-        reader.root = reader.read(path, ())
-        return reader
-    except RecursionError:
-        raise DescriptionError(path, "elements are nested too deep") from None
+    return _Reader(path).files
 
 
 def _real(path: Path) -> Path:
@@ -115,9 +105,12 @@ class _Reader:
         self.elements = 0
         self.files: list[Path] = []
         self.left_out: list[str] = []
-        self.root = ET.Element("mujoco")
+        try:
+            self.root = self._read(path, ())
+        except RecursionError:
+            raise DescriptionError(path, "elements are nested too deep") from None
 
-    def read(self, path: Path, above: tuple[Path, ...]) -> ET.Element:
+    def _read(self, path: Path, above: tuple[Path, ...]) -> ET.Element:
         real = _real(path)
         if not real.is_relative_to(self.folder):  # a file may be a stranger's
             self.left_out.append(os.path.relpath(path, self.folder))
@@ -142,7 +135,7 @@ class _Reader:
             if not file:
                 raise DescriptionError(path, "an <include> has no file")
             place = list(element).index(child)
-            element[place : place + 1] = list(self.read(self.folder / file, above))
+            element[place : place + 1] = list(self._read(self.folder / file, above))
 
 
 def _strip(path: Path, element: ET.Element) -> None:

@@ -7,7 +7,7 @@ counterpart is left out or approximated with a note.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,8 @@ from .._extras import require
 from ..exceptions import DescriptionError
 from ..typing import Array
 from ._xml import listed
-from .branch import hand_below
 from .mjcf import compile_mjcf
 from .mjcf_tendons import element_name
-from .mjcf_things import things
 from .mjcf_transmission import MjcfTransmission
 from .shape import Shape
 from .urdf import UrdfJoint, UrdfLink, UrdfModel, root_of
@@ -49,7 +47,7 @@ def read_mjcf(path: str | Path, base_link: str | None = None, named: Iterable[st
     """Read the hand at ``path``: what ``base_link`` carries, or all that stands on the world.
 
     Joints that slide or are balls are held and things that nothing drives are left out, with notes.
-    ``named``: as of :func:`~torch_ekm.description.branch.hand_below`.
+    ``named``: as of :meth:`~torch_ekm.description.urdf.UrdfModel.below`.
 
     Raises:
         DescriptionError: as :func:`~torch_ekm.description.mjcf.compile_mjcf`; no hinge, no such link, a loop
@@ -78,7 +76,7 @@ class _Conversion:
         links, joints = self._tree()
         name = model.names[: model.names.index(b"\0")].decode() or path.stem
         robot = UrdfModel(path, name, tuple(links), tuple(joints), root_of(path, links, joints))
-        urdf = hand_below(robot, base, named)
+        urdf = robot.below(base, named)
         self.whole = urdf is robot
         self.notes = [*notes, *urdf.notes]
         self.of = self.of if self.whole else {}
@@ -114,7 +112,7 @@ class _Conversion:
     def _tree(self) -> tuple[list[UrdfLink], list[UrdfJoint]]:
         model = self.model
         names = {b: element_name(model, "body", b) for b in range(1, model.nbody)}
-        left_out, links, joints = things(model, names), [self._link(_WORLD, 0, np.eye(4))], []
+        left_out, links, joints = self._things(names), [self._link(_WORLD, 0, np.eye(4))], []
         for b in sorted(left_out & set(model.body_rootid.tolist())):
             self._note("these move and nothing drives them: they are left out", names[b])
         frame = self.frames
@@ -122,22 +120,20 @@ class _Conversion:
             if b in left_out:
                 continue
             parent, offset = frame[int(model.body_parentid[b])]
-            at = offset @ _pose(model.body_pos[b], self._rotation(model.body_quat[b]))
+            at = offset @ self._pose(model.body_pos[b], model.body_quat[b])
             kinds = [(j, int(model.jnt_type[j]) == self._kind.mjJNT_HINGE) for j in self._joints_of(b)]
             hinges = [j for j, hinge in kinds if hinge]
             self.held += [(model.joint(j).name or name, name) for j, hinge in kinds if not hinge]
             for k, j in enumerate(hinges):
                 child = name if k == len(hinges) - 1 else f"{name}/{k + 1}"
                 joint = element_name(model, "joint", j)
-                anchor, axis = _pose(model.jnt_pos[j]), model.jnt_axis[j]
-                reference = float(model.qpos0[model.jnt_qposadr[j]])
-                back = _pose(np.zeros(3), self._about(axis, -reference))
-                joints.append(
-                    UrdfJoint(joint, "revolute", parent, child, at @ anchor @ back, axis, *self._limits(j))
-                )
+                anchor, axis, back = self._pose(model.jnt_pos[j]), model.jnt_axis[j], np.zeros(4)
+                self._mj.mju_axisAngle2Quat(back, axis, -model.qpos0[model.jnt_qposadr[j]])
+                placed = at @ anchor @ self._pose(np.zeros(3), back)
+                joints.append(UrdfJoint(joint, "revolute", parent, child, placed, axis, *self._limits(j)))
                 self.hinges.append(j)
                 self.names[j] = joint
-                parent, at = child, _pose(-model.jnt_pos[j])
+                parent, at = child, self._pose(-model.jnt_pos[j])
                 if child != name:
                     links.append(UrdfLink(child, 0.0, np.zeros(3), np.zeros((3, 3)), ()))
             if not hinges:
@@ -148,6 +144,24 @@ class _Conversion:
             links.append(self._link(name, b, at))
             frame[b] = (name, at)
         return links, joints
+
+    def _things(self, bodies: Iterable[int]) -> set[int]:
+        """Bodies that move on the world and that nothing drives, with all that they carry.
+
+        Where there is neither actuator nor tendon nor equality: those that float and carry no joint.
+        """
+        model, kinds = self.model, {}
+        for kind, body in zip(model.jnt_type.tolist(), model.jnt_bodyid.tolist(), strict=True):
+            kinds.setdefault(int(model.body_rootid[body]), []).append(kind)
+        data = self._mj.MjData(model)
+        self._mj.mj_forward(model, data)
+        dofs = {*data.moment_colind.tolist(), *model.ten_J_colind.tolist()}
+        for kind, *ends in zip(model.eq_type, model.eq_obj1id, model.eq_obj2id, strict=True):
+            dofs |= {int(model.jnt_dofadr[j]) for j in ends if kind == self._mj.mjtEq.mjEQ_JOINT and j >= 0}
+        driven = {int(model.body_rootid[model.dof_bodyid[dof]]) for dof in dofs}
+        floats = [int(self._kind.mjJNT_FREE)]
+        found = {root for root, on_it in kinds.items() if (root not in driven if driven else on_it == floats)}
+        return {body for body in bodies if int(model.body_rootid[body]) in found}
 
     def _joints_of(self, body: int) -> range:
         first = int(self.model.body_jntadr[body])
@@ -161,7 +175,7 @@ class _Conversion:
 
     def _link(self, name: str, body: int, at: Array) -> UrdfLink:
         model = self.model
-        inertial = at @ _pose(model.body_ipos[body], self._rotation(model.body_iquat[body]))
+        inertial = at @ self._pose(model.body_ipos[body], model.body_iquat[body])
         inertia = inertial[:3, :3] @ np.diag(model.body_inertia[body]) @ inertial[:3, :3].T
         geoms = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
         shapes = [shape for g in geoms if body and (shape := self._shape(name, g, at)) is not None]
@@ -173,7 +187,7 @@ class _Conversion:
     def _shape(self, link: str, geom: int, at: Array) -> Shape | None:
         model, kinds = self.model, self._mj.mjtGeom
         kind, (x, y, z) = int(model.geom_type[geom]), (2 * model.geom_size[geom]).tolist()
-        place = at @ _pose(model.geom_pos[geom], self._rotation(model.geom_quat[geom]))
+        place = at @ self._pose(model.geom_pos[geom], model.geom_quat[geom])
         if not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             return None  # it is only drawn
         if kind == kinds.mjGEOM_BOX:
@@ -185,20 +199,8 @@ class _Conversion:
         self._note("shapes other than box, sphere, capsule and cylinder touch nothing, those of", link)
         return None
 
-    def _rotation(self, quaternion: Array) -> Array:
-        matrix = np.zeros(9)
-        self._mj.mju_quat2Mat(matrix, quaternion)
-        return matrix.reshape(3, 3)
-
-    def _about(self, axis: Array, angle: float) -> Array:
-        quaternion = np.zeros(4)
-        self._mj.mju_axisAngle2Quat(quaternion, axis, angle)
-        return self._rotation(quaternion)
-
-
-def _pose(position: Array, rotation: Array | None = None) -> Array:
-    matrix = np.eye(4)
-    matrix[:3, 3] = position
-    if rotation is not None:
-        matrix[:3, :3] = rotation
-    return matrix
+    def _pose(self, position: Array, quaternion: Sequence[float] | Array = (1.0, 0.0, 0.0, 0.0)) -> Array:
+        matrix, rotation = np.eye(4), np.zeros(9)
+        self._mj.mju_quat2Mat(rotation, np.array(quaternion))
+        matrix[:3, :3], matrix[:3, 3] = rotation.reshape(3, 3), position
+        return matrix

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,46 +16,38 @@ from .lengths import typical_arms
 from .mjcf_tendons import RoutedTendons, element_name
 from .urdf import UrdfModel
 
-_NARROW = (
-    0.2  # a limited tendon is a coupling if it may move by less than this share of what its joints allow
-)
+_NARROW = 0.2  # of what its joints allow: a limited tendon that may move by less is a coupling
 _DRAWN = 200  # postures at which the length of a spatial tendon is looked at
 _OFF = 1e-9  # [rad] or [m] by which springs at rest may miss an equality
 _Tie = tuple[str, Array, float]
 """Name of a coupling, its row ``(n_q,)`` and its value."""
 
 
+@dataclass(eq=False)
 class MjcfTransmission:
     """Reads ``[joints]``, ``[[actuators]]``, ``[[couplings]]``, ``[[tendon_springs]]`` and ``[[loops]]``.
 
     Joints that are not of the hand stay where MuJoCo counts them from.
-
-    Args:
-        urdf: the hand.
-        model: MuJoCo's.
-        names: of MuJoCo's joints, by their numbers; those of the hand in the order of q.
-        frames: of MuJoCo's bodies: the link of each, and its frame in the link's.
-        held: links that another joint than a hinge carries, which is held.
-        whole: nothing of the file is left out.
-        note: takes what is assumed, and of what.
     """
 
-    def __init__(
-        self,
-        urdf: UrdfModel,
-        model: Any,
-        names: dict[int, str],
-        frames: dict[int, tuple[str, Array]],
-        held: set[str],
-        whole: bool,
-        note: Callable[[str, str], None],
-    ) -> None:
-        self.path, self.urdf, self.model, self.whole, self._note = urdf.path, urdf, model, whole, note
-        self._mj = require("mujoco")
-        self.names, self.hinges, self._frames, self._held = names, list(names), frames, held
-        limited = [bool(model.jnt_limited[j]) for j in self.hinges]
-        ends = np.where(np.array(limited)[:, None], model.jnt_range[self.hinges], [-np.inf, np.inf])
-        self.lower, self.upper = ends.T
+    urdf: UrdfModel
+    model: Any
+    names: dict[int, str]
+    """Of MuJoCo's joints, by their numbers; those of the hand in the order of q."""
+    frames: dict[int, tuple[str, Array]]
+    """Of MuJoCo's bodies: the link of each, and its frame in the link's."""
+    held: set[str]
+    """Links that another joint than a hinge carries, which is held."""
+    whole: bool
+    """Nothing of the file is left out."""
+    note: Callable[[str, str], None]
+    """Takes what is assumed, and of what."""
+
+    def __post_init__(self) -> None:
+        self._mj, self.hinges = require("mujoco"), list(self.names)
+        joints = self.urdf.moving_joints
+        self.lower = np.array([joint.lower for joint in joints])
+        self.upper = np.array([joint.upper for joint in joints])
         self._drives: list[Array] = []
         self._loops: list[dict[str, Any]] = []
         self._used: set[int] = set()
@@ -76,7 +69,7 @@ class MjcfTransmission:
                 couplings.append(tie)
             else:
                 self._loops.append({"name": tie[0], "mjcf_tendons": {tie[0]: 1.0}, "value": tie[2]})
-            self._note(note, tie[0])
+            self.note(note, tie[0])
         self._note_unread()
         rests, couplings = self._rests(couplings)
         joints = {
@@ -119,11 +112,11 @@ class MjcfTransmission:
             if "stiffness" not in table:
                 rank = int(np.linalg.matrix_rank(self._drives)) if self._drives else 0
                 if np.linalg.matrix_rank([*self._drives, row]) == rank:
-                    self._note("actuators that move only what others do are left out", table["name"])
+                    self.note("actuators that move only what others do are left out", table["name"])
                     continue
                 self._drives.append(row)
                 note = "actuators without position control are taken as rigid, over their whole stroke"
-                self._note(note, table["name"])
+                self.note(note, table["name"])
             kept.append(table)
         return kept
 
@@ -145,7 +138,7 @@ class MjcfTransmission:
         way = None if tendon is None or self._is_fixed(tendon) else tendon
         if not row.any():
             if self.whole:
-                self._note("actuators that drive no joint of the hand are left out", name)
+                self.note("actuators that drive no joint of the hand are left out", name)
             return None
         length = self._span(row) + offset if way is None else self._way_span(way, gear)
         table: dict[str, Any] = {"name": name}
@@ -158,7 +151,7 @@ class MjcfTransmission:
             ends = np.clip(length, *np.sort(gear * model.tendon_range[tendon]))
             if ends[0] != ends[1] and not np.allclose(ends, length, rtol=1e-3):
                 length = ends
-                self._note("ranges of motors end at the limits of their tendons", name)
+                self.note("ranges of motors end at the limits of their tendons", name)
         sign = -1.0 if pulls_back else 1.0
         table["range"] = sorted((sign * length).tolist()) if np.isfinite(length).all() else [TODO, TODO]
         if way is None:
@@ -168,7 +161,7 @@ class MjcfTransmission:
         table["tendon"] = bool(pulls_back or low >= 0)
         if tendon is not None and np.abs(row).max() < 0.1:
             counted = "plants and models count in its largest arm"
-            self._note(f"these count in the length of their tendon, not in rad; {counted}", name)
+            self.note(f"these count in the length of their tendon, not in rad; {counted}", name)
         return table, row
 
     def _driven(self, k: int) -> tuple[Array, float, float, int | None]:
@@ -200,25 +193,17 @@ class MjcfTransmission:
     def _tendon_name(self, t: int) -> str:
         return element_name(self.model, "tendon", t)
 
-    def _parts(self, t: int) -> range:
-        return range(self.model.tendon_adr[t], self.model.tendon_adr[t] + self.model.tendon_num[t])
-
     def _is_fixed(self, t: int) -> bool:
-        joint = self._mj.mjtWrap.mjWRAP_JOINT
-        return all(int(self.model.wrap_type[w]) == joint for w in self._parts(t))
+        parts = slice(self.model.tendon_adr[t], self.model.tendon_adr[t] + self.model.tendon_num[t])
+        return bool((self.model.wrap_type[parts] == int(self._mj.mjtWrap.mjWRAP_JOINT)).all())
 
     def _tendon(self, t: int) -> tuple[Array, float]:
         """Moment arms ``(n_q,)`` and length at zero angles of a fixed tendon; of others typical arms, 0."""
-        model = self.model
+        routed = RoutedTendons(self.model, [{t: 1.0}], self.hinges)
         if not self._is_fixed(t):
-            routed = RoutedTendons(model, [{t: 1.0}], self.hinges)
             return typical_arms(routed, self.lower, self.upper, self._rest())[0], 0.0
-        row, held = np.zeros(len(self.hinges)), 0.0
-        for w in self._parts(t):
-            unit = self._unit(int(model.wrap_objid[w]))
-            row += model.wrap_prm[w] * unit
-            held += 0.0 if unit.any() else model.wrap_prm[w] * self._start(int(model.wrap_objid[w]))
-        return row, float(held)
+        length, arms = routed(np.zeros(len(self.hinges)))
+        return arms[0], float(length[0])
 
     def _way_span(self, t: int, gear: float) -> Array:
         """Least and largest length of a tendon within the joints' limits ``(2,)``, as far as seen."""
@@ -249,9 +234,9 @@ class MjcfTransmission:
             if model.tendon_stiffnesspoly[t].any() and self._tendon(t)[0].any():
                 bent.append(self._tendon_name(t))
             if model.tendon_frictionloss[t] > 0 and self._tendon(t)[0].any():
-                self._note("friction of tendons is left out", self._tendon_name(t))
+                self.note("friction of tendons is left out", self._tendon_name(t))
         for name in bent:
-            self._note("of springs that are not linear the linear part counts", name)
+            self.note("of springs that are not linear the linear part counts", name)
 
     def _tendon_couplings(self) -> Iterator[tuple[int, str, _Tie]]:
         """Tendons that nobody pulls: those that can hardly move tie their joints; with notes."""
@@ -268,7 +253,7 @@ class MjcfTransmission:
                 tie = self._tendon_name(t), row, (low + high) / 2 - offset
                 yield t, "tendons that can hardly move tie their joints", tie
             else:
-                self._note("limits of tendons are left out", self._tendon_name(t))
+                self.note("limits of tendons are left out", self._tendon_name(t))
 
     # -- equalities ---------------------------------------------------------------------------------
 
@@ -322,7 +307,7 @@ class MjcfTransmission:
         for k, which in enumerate((int(model.eq_obj1id[e]), int(model.eq_obj2id[e]))):
             body = int(model.site_bodyid[which]) if of_sites else which
             point = model.site_pos[which] if of_sites else model.eq_data[e, 3 * k : 3 * k + 3]
-            link, frame = self._frames.get(body, ("", np.eye(4)))
+            link, frame = self.frames.get(body, ("", np.eye(4)))
             links.append(link)
             points.append((frame[:3, :3] @ point + frame[:3, 3]).tolist())
         first, second = ({joint.child: joint.kind for joint in self.urdf.joints_to(link)} for link in links)
@@ -331,12 +316,12 @@ class MjcfTransmission:
             return  # what carries the hand, or the rest of the robot
         if kind != self._mj.mjtEq.mjEQ_CONNECT:
             problem = f"equality '{name}' welds bodies: only joints, tendons and points are tied"
-            raise DescriptionError(self.path, problem)
+            raise DescriptionError(self.urdf.path, problem)
         if not set(links) <= {link.name for link in self.urdf.links}:
-            self._note("points that are pinned to what is not of the hand are free", name)
+            self.note("points that are pinned to what is not of the hand are free", name)
             return
-        if self._held & between:
-            self._note("loops that close through joints that are held are left out", name)
+        if self.held & between:
+            self.note("loops that close through joints that are held are left out", name)
             return
         self._loops.append({"name": name, "links": links, "points": points})
 
@@ -345,7 +330,7 @@ class MjcfTransmission:
         model = self.model
         first, second = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
         if kind != self._mj.mjtEq.mjEQ_JOINT:
-            raise DescriptionError(self.path, f"equality '{name}' of tendons is not linear")
+            raise DescriptionError(self.urdf.path, f"equality '{name}' of tendons is not linear")
         start, other = self._start(first), self._start(second)
         curve = np.polynomial.Polynomial(model.eq_data[e, :5])(np.polynomial.Polynomial([-other, 1.0]))
         arms = {self.names[second]: (-curve.deriv().coef).tolist()}

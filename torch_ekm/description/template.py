@@ -12,7 +12,6 @@ import numpy as np
 from .._files import write_whole
 from ..exceptions import DescriptionError, UnknownNameError
 from ._toml import TODO
-from .branch import hand_below
 from .mjcf_hand import MjcfHand, read_mjcf
 from .registry import HAND_FILES
 from .transmission import unheld_of
@@ -85,7 +84,7 @@ def write_template(urdf: str | Path, base_link: str | None = None) -> Path:
         raise UnknownNameError("URDF or MJCF", str(urdf), ("a path to a .urdf, .xml or .mjcf file",))
     mjcf = read_mjcf(path, base_link) if path.suffix != ".urdf" else None
     model = read_urdf(path) if mjcf is None else mjcf.urdf
-    model = hand_below(model, base_link or model.root)
+    model = model.below(base_link or model.root)
     notes = list(model.notes)
     if base_link is None and (count := len(model.moving_joints)) > _MANY:
         notes.append(f"all {count} joints are the hand's; of a robot, --base LINK keeps those beyond a link")

@@ -6,10 +6,10 @@ contact pads, Hall sensors. The format is documented in ``docs/reference/file_fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -17,10 +17,8 @@ from ..exceptions import DescriptionError, JointMismatchError
 from ..typing import Array
 from ._toml import TODO, TomlTable, read_toml
 from ._xml import listed
-from .branch import hand_below
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .length_tables import LOOP, SPRING, LengthReader
-from .lengths import Lengths, Loops, TendonSprings
 from .mimic import overruled, unheld_joints
 from .mjcf_hand import MjcfHand
 from .urdf import UrdfJoint, UrdfModel
@@ -38,7 +36,6 @@ COUPLING = ("name", "joints")
 PAD = ("name", "link", "start", "end", "radius", "direction", "torsional_friction")
 HALL = ("joint", "channel", "open", "closed")
 _TURN = 6.3  # [rad]
-T = TypeVar("T")
 
 
 def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None) -> HandDescription:
@@ -59,109 +56,76 @@ def read_transmission(path: Path, urdf: UrdfModel, mjcf: MjcfHand | None = None)
     else:
         data = read_toml(path, "transmission file")
     _check_filled_in(path, data)
+    hand = replace(_hand(path, data, urdf, mjcf), transmission_path=written)
+    _check_mechanism(path, hand, [table["name"] for table in data.get("couplings", [])])
+    return hand
+
+
+def _hand(path: Path, data: dict[str, Any], urdf: UrdfModel, mjcf: MjcfHand | None) -> HandDescription:
     top = TomlTable(path, "top level", data, TABLES)
     if not isinstance(data.get("notes", {}), dict):
         raise top.error("'notes' must be a table of text, which no program reads")
-    hand = TomlTable(path, "[hand]", top.data.get("hand"), HAND)
-    base, given = hand.text("base_link", urdf.root), top.data.get("joints", {})
-    robot, urdf = urdf, hand_below(urdf, base, given if isinstance(given, dict) else (), path)
+    hand = TomlTable(path, "[hand]", data.get("hand"), HAND)
+    base, given = hand.text("base_link", urdf.root), data.get("joints", {})
+    robot, urdf = urdf, urdf.below(base, given if isinstance(given, dict) else (), path)
     joints = urdf.moving_joints
     names = tuple(joint.name for joint in joints)
     if not names:
         raise hand.error(f"base_link '{base}' carries no revolute or continuous joint")
-    springs = _joint_table(path, given, names, {joint.name for joint in robot.joints})
-    mechanism = _mechanism(top, LengthReader(urdf, names, springs[:, 1], mjcf), springs[:, 0])
-    actuators = [_actuator(table) for table in mechanism.motors]
-    J_a, C = mechanism.lengths.typical, mechanism.C
-    notes = [*overruled(urdf.mimics, names, C, springs[:, 1]), *_odd_limits(joints, C)]
+    spring, rest, friction = _joint_table(path, given, names, {joint.name for joint in robot.joints}).T
+    reader = LengthReader(urdf, names, rest, mjcf)
+    motors = _each(top, "actuators", ACTUATOR)
+    lengths = reader.lengths(motors)
+    C = _couplings(_each(top, "couplings", COUPLING), names)
+    actuators = tuple(map(_actuator, motors))
+    pads = tuple(_pad(table, urdf) for table in _each(top, "pads", PAD))
+    hall = tuple(_hall(table, names) for table in _each(top, "hall_sensors", HALL))
     _check_unique(path, "actuator", [actuator.name for actuator in actuators])
-    _check_mechanism(path, mechanism)
-    pads = _each(top, "pads", lambda place, data: _pad(path, place, data, urdf))
-    hall = _each(top, "hall_sensors", lambda place, data: _hall(path, place, data, names))
     _check_unique(path, "pad", [pad.name for pad in pads])
     _check_unique(path, "Hall channel", [str(sensor.channel) for sensor in hall])
-    normal = hand.vector("planar_normal", 3) if "planar_normal" in hand.data else None
-    gravity = hand.vector("gravity", 3, HandDescription.gravity)
     return HandDescription(
         name=hand.text("name"),
         urdf=urdf,
-        transmission_path=written,
+        transmission_path=path,
         base_link=base,
         link_names=tuple(link.name for link in urdf.links),
         joint_names=names,
         joint_lower=np.array([joint.lower for joint in joints]),
         joint_upper=np.array([joint.upper for joint in joints]),
-        actuators=tuple(actuators),
-        actuation_jacobian=J_a,
+        actuators=actuators,
+        actuation_jacobian=lengths.typical,
         coupling=C,
-        spring_stiffness=springs[:, 0],
-        spring_rest=springs[:, 1],
-        joint_friction=springs[:, 2],
-        pads=tuple(pads),
-        hall_sensors=tuple(hall),
-        planar_normal=None if normal is None else (normal[0], normal[1], normal[2]),
-        gravity=(gravity[0], gravity[1], gravity[2]),
+        spring_stiffness=spring,
+        spring_rest=rest,
+        joint_friction=friction,
+        pads=pads,
+        hall_sensors=hall,
+        planar_normal=_point(hand.vector("planar_normal", 3)) if "planar_normal" in hand.data else None,
+        gravity=_point(hand.vector("gravity", 3, HandDescription.gravity)),
         pinch_force=hand.number("pinch_force", HandDescription.pinch_force, positive=True),
-        notes=(*urdf.notes, *notes),
-        arm_functions=None if mechanism.lengths.constant else mechanism.lengths,
-        tendon_springs=mechanism.tendon_springs,
-        loops=mechanism.loops,
+        notes=(*urdf.notes, *overruled(urdf.mimics, names, C, rest), *_odd_limits(joints, C)),
+        arm_functions=None if lengths.constant else lengths,
+        tendon_springs=reader.springs(_each(top, "tendon_springs", SPRING)),
+        loops=reader.loops(_each(top, "loops", LOOP)),
     )
 
 
-@dataclass(frozen=True)
-class _Mechanism:
-    """What holds the joints, before any figure of the motors is asked for."""
-
-    names: tuple[str, ...]
-    rest: Array
-    spring: Array
-    motors: list[TomlTable]
-    lengths: Lengths
-    C: Array
-    tied: tuple[str, ...]
-    """Names of its rows."""
-    tendon_springs: TendonSprings | None
-    loops: Loops | None
-
-    @property
-    def unheld(self) -> list[str]:
-        """Joints that nothing holds at the springs' rest, as if all springs of tendons were stretched."""
-        K, rows = np.diag(self.spring), np.vstack([self.lengths.typical, self.C])
-        if self.tendon_springs is not None:
-            arms = self.tendon_springs.lengths.typical
-            K = K + arms.T @ (self.tendon_springs.stiffness[:, None] * arms)
-        if self.loops is not None:
-            rows = np.vstack([rows, self.loops.lengths.jacobian(self.rest)])
-        return unheld_joints(self.names, rows, K)
-
-
-def _mechanism(top: TomlTable, reader: LengthReader, spring: Array) -> _Mechanism:
-    def each(key: str, valid: tuple[str, ...]) -> list[TomlTable]:
-        return _each(top, key, lambda place, data: TomlTable(top.path, place, data, valid))
-
-    motors, couplings = each("actuators", ACTUATOR), each("couplings", COUPLING)
-    weights = [(table.place, table.weights("joints")) for table in couplings]
-    return _Mechanism(
-        names=reader.names,
-        rest=reader.rest,
-        spring=spring,
-        motors=motors,
-        lengths=reader.lengths(motors),
-        C=_rows(top.path, reader.names, weights),
-        tied=tuple(table.text("name") for table in couplings),
-        tendon_springs=reader.springs(each("tendon_springs", SPRING)),
-        loops=reader.loops(each("loops", LOOP)),
-    )
+def unheld(hand: HandDescription) -> list[str]:
+    """Joints that no spring, actuator, coupling or loop holds at rest, as if all springs of tendons were
+    stretched."""
+    rows, K = np.vstack([hand.actuation_jacobian, hand.coupling]), np.diag(hand.spring_stiffness)
+    if (springs := hand.tendon_springs) is not None:
+        arms = springs.lengths.typical
+        K = K + arms.T @ (springs.stiffness[:, None] * arms)
+    if hand.loops is not None:
+        rows = np.vstack([rows, hand.loops.lengths.jacobian(hand.spring_rest)])
+    return unheld_joints(hand.joint_names, rows, K)
 
 
 def unheld_of(mjcf: MjcfHand) -> list[str]:
-    """The joints of an MJCF that nothing holds, as far as it says: no spring, actuator, coupling or loop."""
-    path, urdf = mjcf.urdf.path, mjcf.urdf
-    names = tuple(joint.name for joint in urdf.moving_joints)
-    springs = _joint_table(path, mjcf.tables["joints"], names, set())
-    top = TomlTable(path, "top level", mjcf.tables, TABLES)
-    return _mechanism(top, LengthReader(urdf, names, springs[:, 1], mjcf), springs[:, 0]).unheld
+    """The joints of an MJCF that nothing holds, as far as it says, whatever the ranges of its motors."""
+    motors = [table | {"range": [0.0, 1.0]} for table in mjcf.tables["actuators"]]
+    return unheld(_hand(mjcf.urdf.path, mjcf.tables | {"actuators": motors}, mjcf.urdf, mjcf))
 
 
 def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
@@ -185,15 +149,15 @@ def _check_filled_in(path: Path, data: dict[str, Any]) -> None:
         raise DescriptionError(path, f"still to be filled in: {', '.join(left)}{_where(path)}")
 
 
-def _each(top: TomlTable, key: str, read: Callable[[str, Any], T]) -> list[T]:
+def _each(top: TomlTable, key: str, valid: tuple[str, ...]) -> list[TomlTable]:
     entries = top.data.get(key, [])
     if not isinstance(entries, list):
         raise DescriptionError(top.path, f"'{key}' must be written as [[{key}]], one table for each")
-    results = []
+    tables = []
     for k, data in enumerate(entries):
         label = data.get("name", data.get("joint", k + 1)) if isinstance(data, dict) else k + 1
-        results.append(read(f"[[{key}]] '{label}'", data))
-    return results
+        tables.append(TomlTable(top.path, f"[[{key}]] '{label}'", data, valid))
+    return tables
 
 
 def _actuator(table: TomlTable) -> Actuator:
@@ -215,35 +179,35 @@ def _actuator(table: TomlTable) -> Actuator:
     )
 
 
-def _pad(path: Path, place: str, data: Any, urdf: UrdfModel) -> ContactPad:
-    table = TomlTable(path, place, data, PAD)
+def _point(values: tuple[float, ...]) -> tuple[float, float, float]:
+    x, y, z = values
+    return x, y, z
+
+
+def _pad(table: TomlTable, urdf: UrdfModel) -> ContactPad:
     link, links = table.text("link"), [link.name for link in urdf.links]
     if link not in links:
         raise table.error(f"unknown link '{link}'; the URDF's links are: {', '.join(links)}")
     start = table.vector("start", 3)
-    end = table.vector("end", 3, start)
-    direction = np.array(table.vector("direction", 3, (0.0, 1.0, 0.0)))
+    direction = np.array(table.vector("direction", 3, ContactPad.direction))
     if np.linalg.norm(direction) < 1e-9:
         raise table.error("'direction' must not be zero")
-    direction = direction / np.linalg.norm(direction)
     return ContactPad(
         name=table.text("name"),
         link=link,
-        start=(start[0], start[1], start[2]),
-        end=(end[0], end[1], end[2]),
+        start=_point(start),
+        end=_point(table.vector("end", 3, start)),
         radius=table.number("radius", positive=True),
-        direction=(float(direction[0]), float(direction[1]), float(direction[2])),
+        direction=_point(tuple((direction / np.linalg.norm(direction)).tolist())),
         torsional_friction=table.number("torsional_friction", 0.0, minimum=0.0),
     )
 
 
-def _hall(path: Path, place: str, data: Any, names: tuple[str, ...]) -> HallSensor:
-    table = TomlTable(path, place, data, HALL)
+def _hall(table: TomlTable, names: tuple[str, ...]) -> HallSensor:
     joint = table.text("joint")
     if joint not in names:
-        raise JointMismatchError(path, (), (joint,), names)
-    channel = table.whole("channel")
-    return HallSensor(joint, channel, table.number("open", 255.0), table.number("closed", 0.0))
+        raise JointMismatchError(table.path, (), (joint,), names)
+    return HallSensor(joint, table.whole("channel"), table.number("open", 255.0), table.number("closed", 0.0))
 
 
 def _joint_table(path: Path, data: Any, names: tuple[str, ...], robot: set[str]) -> np.ndarray:
@@ -264,32 +228,32 @@ def _joint_table(path: Path, data: Any, names: tuple[str, ...], robot: set[str])
     return np.array(rows)
 
 
-def _rows(path: Path, names: tuple[str, ...], entries: list[tuple[str, dict[str, float]]]) -> np.ndarray:
-    matrix = np.zeros((len(entries), len(names)))
-    for row, (_, weights) in enumerate(entries):
-        unexpected = [name for name in weights if name not in names]
-        if unexpected:
-            raise JointMismatchError(path, (), unexpected, names)
+def _couplings(tables: list[TomlTable], names: tuple[str, ...]) -> np.ndarray:
+    matrix = np.zeros((len(tables), len(names)))
+    for row, table in zip(matrix, tables, strict=True):
+        weights = table.weights("joints")
+        table.text("name")
+        if unexpected := [name for name in weights if name not in names]:
+            raise JointMismatchError(table.path, (), unexpected, names)
         for name, weight in weights.items():
-            matrix[row, names.index(name)] = weight
+            row[names.index(name)] = weight
     return matrix
 
 
-def _check_mechanism(path: Path, mechanism: _Mechanism) -> None:
+def _check_mechanism(path: Path, hand: HandDescription, couplings: list[str]) -> None:
     """``[J_a; C]`` must have full row rank, and springs and loops must hold what it leaves free."""
-    J_a, C = mechanism.lengths.typical, mechanism.C
-    if not len(J_a):
+    if not hand.n_a:
         raise DescriptionError(path, "[[actuators]]: at least 1 such table(s) must be given")
-    B = np.vstack([J_a, C])
+    B = np.vstack([hand.actuation_jacobian, hand.coupling])
     U, singular, _ = np.linalg.svd(B)
     rank = int((singular > 1e-9 * singular[0]).sum())
     if rank < len(B):
-        names = [*(table.text("name") for table in mechanism.motors), *mechanism.tied]
+        names = [*hand.actuator_names, *couplings]
         alike = [name for name, part in zip(names, np.abs(U[:, rank:]), strict=True) if part.max() > 1e-6]
-        parts = f"{len(J_a)} actuators and {len(C)} couplings give only {rank} independent rows"
+        parts = f"{hand.n_a} actuators and {len(couplings)} couplings give only {rank} independent rows"
         parts = f"{parts}; one or more of these move nothing of their own: {', '.join(alike)}"
         raise DescriptionError(path, f"moment arms and couplings must be linearly independent: {parts}")
-    if loose := mechanism.unheld:
+    if loose := unheld(hand):
         problem = f"no spring, actuator or coupling holds the joints {', '.join(loose)}"
         problem += f": give them a positive 'spring' in [joints]{_where(path)}"
         raise DescriptionError(path, problem)

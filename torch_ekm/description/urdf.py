@@ -10,8 +10,8 @@ from __future__ import annotations
 import io
 import math
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -126,6 +126,50 @@ class UrdfModel:
         for joint in self.joints_to(link):
             T = T @ joint.transform
         return T
+
+    def below(self, base: str, named: Iterable[str] = (), path: Path | None = None) -> UrdfModel:
+        """The part that ``base`` carries, as a tree of its own, with a note on what is left out.
+
+        A base that carries no joint is a frame: of all that is carried by what it is fixed to. One that is
+        fixed to the root keeps the whole tree if a joint ``named`` is elsewhere. A joint that is a
+        ``<mimic>`` of one that is left out is locked.
+
+        Raises:
+            DescriptionError: there is no link of that name; it names ``path``, or the URDF.
+        """
+        names = [link.name for link in self.links]
+        if base not in names:
+            problem = f"unknown base_link '{base}'; links are: {', '.join(names)}"
+            raise DescriptionError(path or self.path, problem)
+        top, joints, to_base = base, self._beyond(base), self.joints_to(base)
+        while to_base and to_base[-1].kind == "fixed" and not any(joint.kind in MOVING for joint in joints):
+            top = to_base.pop().parent
+            joints = self._beyond(top)
+        kept = {joint.name for joint in joints}
+        left_out = {joint.name for joint in self.moving_joints} - kept
+        fixed = all(joint.kind == "fixed" for joint in to_base)
+        if not left_out or (fixed and left_out & set(named)):
+            return self
+        notes = [f"the hand is what '{top}' carries; {len(left_out)} joints elsewhere are left out"]
+        mimics = []
+        for mimic in self.mimics:
+            if mimic.joint in kept and mimic.other in left_out:
+                notes.append(
+                    f"'{mimic.joint}' is a <mimic> of '{mimic.other}', which is left out: it is locked"
+                )
+                mimic = replace(mimic, multiplier=0.0)
+            mimics += [mimic] if mimic.joint in kept else []
+        below = {top, *(joint.child for joint in joints)}
+        links = tuple(link for link in self.links if link.name in below)
+        notes = (*notes, *self.notes)
+        return replace(self, links=links, joints=joints, root=top, mimics=tuple(mimics), notes=notes)
+
+    def _beyond(self, link: str) -> tuple[UrdfJoint, ...]:
+        """The joints that a link carries, in document order."""
+        below = [link]
+        for one in below:
+            below += [joint.child for joint in self.joints if joint.parent == one]
+        return tuple(joint for joint in self.joints if joint.parent in below)
 
 
 def read_urdf(path: str | Path) -> UrdfModel:

@@ -18,8 +18,7 @@ from ..sensing.vision.track import Track
 from ..sensing.vision.tracker import MarkerTracker
 from ..typing import Array, Tensor
 from .hall_sensors import HallSensors
-from .imaging.card_scene import CardScene
-from .imaging.grasp_view import camera_facing, grasp_scene
+from .imaging.card_scene import CardScene, camera_facing, grasp_scene
 from .imaging.simulated_camera import SimulatedCamera
 
 _LOOKS = 5  # pictures tried for one observation

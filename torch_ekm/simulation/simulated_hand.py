@@ -23,9 +23,8 @@ from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor
 from .config import PlantConfig
-from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, solve
+from .grasp_planning.pinch import PinchPlan, pinch_hint, pinch_problem, remembered_pinch, solve
 from .grasp_planning.pinch_problem import PinchRequest
-from .grasp_planning.remembered import remembered_pinch
 from .mechanism.assembly import true_hand, true_object
 from .parameters import PlantParameters
 from .physics.rig import Rig
@@ -118,14 +117,9 @@ class SimulatedHand:
         """
         self._generator = np.random.default_rng(check_count("seed", seed, least=0))
         if self._rig is None:
-            self._rig = Rig(
-                self.hand,
-                self.object,
-                self.config,
-                self.parameters,
-                lambda frame: self._sensors.remember(frame),  # a restored plant has other sensors
-                self.engine,
-            )
+            described = self.hand, self.object, self.config, self.parameters
+            # a restored plant has other sensors
+            self._rig = Rig(*described, lambda frame: self._sensors.remember(frame), self.engine)
         if self._ungraspable is not None:
             raise self._ungraspable
         unplanned = 0

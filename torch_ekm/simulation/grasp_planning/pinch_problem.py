@@ -70,6 +70,7 @@ class PinchGeometry:
     """``J_h^T f``: what springs and actuators must supply ``(b, n_q)`` [N m]."""
 
 
+@dataclass(eq=False)
 class PinchProblem:
     """Residuals over posture, object pose and contact forces, ``x = [q_moving; o; phi; f_1 ...]``::
 
@@ -84,32 +85,28 @@ class PinchProblem:
     rounded ends, joints away from their stops, tendons taut, the object where it is wanted, and if asked
     for motors within their ranges.
 
-    Args:
-        hand, obj: the bodies as they really are.
-        transmission: moment arms, springs and stiffness of the plant that will hold the object.
-        thumb, fingers: names of the pads that oppose each other.
-        along: wanted direction of the object's long axis, in the hand frame.
-
     Raises:
         UnknownNameError: there is no such pad; the message lists all.
     """
 
-    def __init__(
-        self,
-        hand: HandDescription,
-        obj: ObjectDescription,
-        transmission: Transmission,
-        thumb: str,
-        fingers: tuple[str, ...],
-        along: Array,
-    ) -> None:
+    hand: HandDescription
+    obj: ObjectDescription
+    """The bodies as they really are."""
+    transmission: Transmission
+    """Moment arms, springs and stiffness of the plant that will hold the object."""
+    thumb: str
+    fingers: tuple[str, ...]
+    """Names of the pads that oppose each other."""
+    along: Array
+    """Wanted direction of the object's long axis, in the hand frame."""
+
+    def __post_init__(self) -> None:
+        hand, obj = self.hand, self.obj
         by_name = {pad.name: pad for pad in hand.pads}
-        for name in (thumb, *fingers):
+        for name in (self.thumb, *self.fingers):
             if name not in by_name:
                 raise UnknownNameError("contact pad", name, by_name)
-        self.hand, self.obj, self.transmission = hand, obj, transmission
-        self.pads = tuple(by_name[name] for name in (thumb, *fingers))
-        self.along = along
+        self.pads = tuple(by_name[name] for name in (self.thumb, *self.fingers))
         self.kinematics = HandKinematics(hand)
         self._links = [self.kinematics.link_index(pad.link) for pad in self.pads]
         self._upstream = self.kinematics.upstream.numpy()[self._links]  # (n_c, n_q)
@@ -221,51 +218,40 @@ class PinchProblem:
         q0 = self._q0[self.moving]
         return q0 + (moving - q0) @ self._untied @ self._untied.T
 
-    def geometry(self, x: Array, near: NDArray[np.intp] | None = None) -> PinchGeometry:
-        """Forward kinematics and distances of a batch of candidates ``(b, n_x)``.
-
-        Candidates that differ from the last one by their forces alone share its geometry. ``near``: numbers
-        of the other parts whose clearance is asked; that of the rest is infinite.
-        """
-        near = np.arange(len(self._ball)) if near is None else near
-        placed = len(self.moving) + 6  # unknowns before the forces
-        own = np.append((x[:-1, :placed] != x[-1, :placed]).any(axis=1), True)
-        rows = np.flatnonzero(own)
-        place = np.where(own, np.cumsum(own) - 1, len(rows) - 1)
-        n = len(self.moving)
-        q, o = self.posture(x[rows, :n]), x[rows, n : n + 3]
-        R = exp(torch.from_numpy(x[rows, n + 3 : placed])).numpy() @ self._nominal
+    def geometry(self, x: Array) -> PinchGeometry:
+        """Forward kinematics and distances of a batch of candidates ``(b, n_x)``."""
+        n, placed = len(self.moving), len(self.moving) + 6  # unknowns before pose, and before forces
+        q, o = self.posture(x[:, :n]), x[:, n : n + 3]
+        R = exp(torch.from_numpy(x[:, n + 3 : placed])).numpy() @ self._nominal
         poses = self.kinematics(torch.from_numpy(q))
         transforms = poses.transforms.numpy()
         links = transforms[:, self._links]
         turn, origin = links[..., :3, :3], links[..., :3, 3]
         centre = origin + np.einsum("bcij,cj->bci", turn, self._tip)
         local = np.einsum("bji,bcj->bci", R, centre - o[:, None])
-        distance, normal = signed_distance(self.obj.shapes, local)
-        n = np.einsum("bij,bcj->bci", R, normal)
-        every = transforms[:, self._ball_link[near], :3]
-        ball = every[..., 3] + np.einsum("bcij,cj->bci", every[..., :3], self._ball[near])
+        distance, outward = signed_distance(self.obj.shapes, local)
+        normal = np.einsum("bij,bcj->bci", R, outward)
+        every = transforms[:, self._ball_link, :3]
+        ball = every[..., 3] + np.einsum("bcij,cj->bci", every[..., :3], self._ball)
         apart, _ = signed_distance(self.obj.shapes, np.einsum("bji,bcj->bci", R, ball - o[:, None]))
-        clearance = np.full((len(rows), len(self._ball)), np.inf)
-        clearance[:, near] = apart - self._ball_radius[near]
-        point = centre - self._radius[:, None] * n
+        point = centre - self._radius[:, None] * normal
         f = x[:, placed:].reshape(len(x), -1, 3)
         axes, origins = (part.numpy() for part in self.kinematics.joint_axes(poses))
         lever = cross(axes[:, None], point[:, :, None] - origins[:, None])  # (b, n_c, n_q, 3)
         return PinchGeometry(
-            q=q[place],
-            position=o[place],
-            rotation=R[place],
+            q=q,
+            position=o,
+            rotation=R,
             force=f,
-            gap=(distance - self._radius)[place],
-            normal=n[place],
-            point=point[place],
-            local=local[place],
-            facing=(normal @ self.axes[:, 1])[place],
-            pad_axis=np.einsum("bcij,cj->bci", turn, self._axis)[place],
-            pad_direction=np.einsum("bcij,cj->bci", turn, self._palmar)[place],
-            clearance=clearance[place],
-            torque=np.einsum("bcqi,bci,cq->bq", lever[place], f, self._upstream),
+            gap=distance - self._radius,
+            normal=normal,
+            point=point,
+            local=local,
+            facing=outward @ self.axes[:, 1],
+            pad_axis=np.einsum("bcij,cj->bci", turn, self._axis),
+            pad_direction=np.einsum("bcij,cj->bci", turn, self._palmar),
+            clearance=apart - self._ball_radius,
+            torque=np.einsum("bcqi,bci,cq->bq", lever, f, self._upstream),
         )
 
     # -- residuals --------------------------------------------------------------------------------------
@@ -284,16 +270,13 @@ class PinchProblem:
             parts.append(loops.gap(g.q) / (1e-4 * np.linalg.norm(loops.lengths.typical, axis=1)))
         return np.concatenate(parts, axis=1)
 
-    def residuals(
-        self, x: Array, request: PinchRequest, ranges: bool, near: NDArray[np.intp] | None = None
-    ) -> Array:
+    def residuals(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
         """Equations and wishes ``(b, n_r)``, to be squared and summed.
 
         Args:
             ranges: wish that the motors keep to theirs.
-            near: as of :meth:`geometry`.
         """
-        g = self.geometry(x, near)
+        g = self.geometry(x)
         f_n = -np.einsum("bci,bci->bc", g.force, g.normal)
         f_t = np.linalg.norm(g.force + f_n[..., None] * g.normal, axis=-1)
         cone = np.maximum(0.0, f_t - 0.4 * self.obj.friction * f_n) / 0.05
@@ -387,14 +370,10 @@ class PinchProblem:
         return (T.spring_torque(inner) + g.torque) / T.shape.arm(inner)
 
     def jacobian(self, x: Array, request: PinchRequest, ranges: bool) -> Array:
-        """Of :meth:`residuals`, central differences, all columns in one batch.
-
-        Parts that are clear of the object stay so in a step.
-        """
+        """Of :meth:`residuals`, central differences, all columns in one batch."""
         step = 1e-6
         shift = step * np.eye(len(x))
-        near = np.flatnonzero(self.geometry(x[None]).clearance[0] < 2 * _CLEAR)
-        values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges, near)
+        values = self.residuals(np.concatenate([x + shift, x - shift]), request, ranges)
         return ((values[: len(x)] - values[len(x) :]) / (2 * step)).T
 
 

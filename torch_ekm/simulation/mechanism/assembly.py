@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError
 from ..parameters import PlantParameters
-from .departures import CableLosses, JointShape
+from .joint_shape import JointShape
 from .transmission import Transmission
 
 _RIGID = 100.0  # [N m/rad] at a joint: 0.3 to 0.4 % of a motion from rigid; stiffer settles worse at 1 ms
@@ -81,8 +80,6 @@ def make_transmission(hand: HandDescription, parameters: PlantParameters) -> Tra
     for pad in hand.pads:  # one joint of each finger
         free = [joint for joint in chain(hand, pad.link) if not coupled[joint]]
         play[draw.choice(free or [0])] = p.joint_play if free else 0.0
-    losses = CableLosses(p.cable_friction, p.hysteresis, p.tendon_coupling, play)
-    law = copy.deepcopy(p.joint_law)
-    transmission = Transmission(true_hand(hand, p), p.tendon_creep, shape, losses, law)
+    transmission = Transmission(true_hand(hand, p), p, shape, play)
     transmission.lengthen(p.tendon_elongation)
     return transmission

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import copy
+from collections.abc import Iterator
 
 import numpy as np
 
 from ...description.hand import HandDescription
 from ...description.lengths import Lengths
 from ...typing import Array
-from .departures import CableLosses, JointShape
+from ..parameters import PlantParameters
+from .joint_shape import JointShape
 
 _COUPLING_STIFFNESS = 8.0  # [N m/rad] at least, of a coupling between fingers: twice that of the motors
 _LOOP_STIFFNESS = 100.0  # [N m/rad] of loops, and couplings within a finger: as rigid as an actuator may be
@@ -45,24 +47,27 @@ class Transmission:
     ``dl/dq``; loops are held by springs of 100 N m/rad at their joints.
 
     Pulleys that are not round and springs that are not linear (``shape``) put ``h(q)`` in the place of q at
-    the tendons, ``h'(q)`` on their arms, and ``x (1 + s x^2)`` in the place of ``q - q0``. Friction of the
-    cables, hysteresis, coupled tendons and play of joints are ``losses``.
+    the tendons, ``h'(q)`` on their arms, and ``x (1 + s x^2)`` in the place of ``q - q0``. What the cables
+    lose is among the ``parameters``::
+
+        |tau_f| <= friction + cable_friction |arm^T T|      Coulomb friction of the joint and of its cables
+        T  = K s + z,  |z| <= (hysteresis/2) k |s|,  dz = k ds while it may grow
+        K^-1 = D (I + tendon_coupling (1 1^T - I)) D,  D = diag(k)^(-1/2)
+        no torque goes through a joint while it is within its play
+
+    Source: a cable round a pulley over the angle w loses the share ``1 - exp(-mu w)`` of its tension (Euler
+    and Eytelwein): cable friction; the elastic hysteresis is that of Masing (1926) with one element;
+    actuators on one frame that gives way are springs in series with a common one: coupling.
 
     Args:
         hand: as it really is; the model's may be another.
-        creep: how fast a loaded tendon lengthens for good [rad/(N m s)].
+        parameters: losses of the cables, ``tendon_creep``, and ``joint_law``, of which this has a copy.
         shape: of pulleys and springs.
-        losses: of cables and joints.
-        law: torques that it adds at the joints, of their angles and of the actuators' torques.
+        play: full width of each joint's ``(n_q,)`` [rad].
     """
 
     def __init__(
-        self,
-        hand: HandDescription,
-        creep: float,
-        shape: JointShape,
-        losses: CableLosses,
-        law: Callable[[Array, Array], Array] | None = None,
+        self, hand: HandDescription, parameters: PlantParameters, shape: JointShape, play: Array
     ) -> None:
         self.stiffness = stiffness = np.array([actuator.stiffness for actuator in hand.actuators])
         """Series stiffness k_a of each actuator, ``(n_a,)`` [N m/rad]."""
@@ -71,7 +76,6 @@ class Transmission:
         self.J_a = hand.actuation_jacobian
         self.offset = hand.actuator_offset
         """a0, which grows as a tendon lengthens ``(n_a,)`` [rad]."""
-        self.creep = creep
         coupling = hand.coupling.reshape(-1, hand.n_q)
         S = coupled_posture(coupling)
         away = np.eye(hand.n_q) - S  # how far each follower is from where it should be
@@ -83,13 +87,18 @@ class Transmission:
         self._pulls_only = np.concatenate(
             [[actuator.tendon for actuator in hand.actuators], np.zeros(len(coupling), bool)]
         ).astype(bool)
-        self._any_tendon, self._any_play = bool(self._pulls_only.any()), bool(losses.play.any())
+        self._any_tendon, self._any_play = bool(self._pulls_only.any()), bool(play.any())
         self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
         self.friction = hand.joint_friction
-        self.shape, self.losses, self.law = shape, losses, law
+        self.shape, self.play, self._p, self.law = (
+            shape,
+            play,
+            parameters,
+            copy.deepcopy(parameters.joint_law),
+        )
         self._followed = (self.J_a - self._lead) @ shape.excursion(self.spring_rest)
         self._apart = self._M[self.n_a :] @ self.spring_rest
-        rubs = (self.friction > 0) | ((self.losses.capstan > 0) & self._lead.any(axis=0))
+        rubs = (self.friction > 0) | ((parameters.cable_friction > 0) & self._lead.any(axis=0))
         self._k_f = np.where(rubs, _BRISTLE_STIFFNESS, 0.0)
         self._bends = self._reach(self.friction)
         varied = 1.0 if self._lengths is None else hand.lengths.largest(*limits)
@@ -97,9 +106,11 @@ class Transmission:
         strong = [(stiffness, self.J_a * varied), (self._k[self.n_a :], self._M[self.n_a :]), *tied]
         self.stiff = bool(max((k[:, None] * arms**2).max(initial=0.0) for k, arms in strong) > _STIFF)
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
-        self._compliance = self.losses.compliance(stiffness)
+        root, shared = 1 / np.sqrt(stiffness), parameters.tendon_coupling
+        self._compliance = root[:, None] * (shared + (1 - shared) * np.eye(self.n_a)) * root
+        """``K^-1`` ``(n_a, n_a)`` [rad/(N m)]."""
         steep = self._k.copy()
-        steep[: self.n_a] *= 1 / (1 - losses.coupling) + (losses.hysteresis > 0)  # bound of dT/ds
+        steep[: self.n_a] *= 1 / (1 - shared) + (parameters.hysteresis > 0)  # bound of dT/ds
         size = np.abs(np.concatenate([self._lead * varied, self._M[self.n_a :], *(arms for _, arms in tied)]))
         steep = np.concatenate([steep, *(k for k, _ in tied)])
         carried = (steep * size.sum(axis=1)) @ size if self.stiff else steep @ size**2
@@ -166,7 +177,7 @@ class Transmission:
 
     def _pull(self, stretch: Array) -> Array:
         """Torque of each actuator; of coupled ones, of those that are taut."""
-        if self.losses.coupling == 0:
+        if self._p.tendon_coupling == 0:
             return self.stiffness * stretch
         taut = np.ones(self.n_a, dtype=bool)
         while True:
@@ -183,7 +194,7 @@ class Transmission:
 
     def lean(self, load: Array) -> Array:
         """How far transmissions at rest are ahead of joints under ``load`` [N m], ``(*batch, n_q)`` [rad]."""
-        return self.losses.play / 2 * np.clip(load / _LEANS, -1.0, 1.0)
+        return self.play / 2 * np.clip(load / _LEANS, -1.0, 1.0)
 
     def spring_torque(self, q: Array) -> Array:
         """``k x (1 + s x^2)``, ``x = q - q0``: what the springs oppose ``(*batch, n_q)`` [N m]."""
@@ -200,7 +211,7 @@ class Transmission:
         inner = q + self._lean
         stretch = self.stretch(inner, motor)
         pull = self._pull(stretch)
-        if self.losses.hysteresis > 0:
+        if self._p.hysteresis > 0:
             pull = pull + self._hysteresis(stretch)
         apart = self._M[self.n_a :] @ inner - self._apart
         force = np.concatenate([pull, -self._k[self.n_a :] * apart])
@@ -217,11 +228,11 @@ class Transmission:
             torque = torque - self.shape.arm(inner) * (away @ self._loops.lengths.jacobian(excursion))
         if self._any_play:
             whole = torque + self._turned * self._lean
-            half = self.losses.play / 2
+            half = self.play / 2
             self._lean = np.clip(whole / self._turned, -half, half)
             torque = whole - self._turned * self._lean
         # the anchor follows where the bristle would carry more than friction
-        capstan = self.losses.capstan
+        capstan = self._p.cable_friction
         reach = self._reach(self.friction + capstan * np.abs(cables)) if capstan > 0 else self._bends
         slip = np.minimum(np.maximum(q - self._anchor, -reach), reach)  # np.clip takes twice as long
         self._anchor = q - slip
@@ -239,7 +250,7 @@ class Transmission:
     def _hysteresis(self, stretch: Array) -> Array:
         """What the transmissions hold against their motion ``(n_a,)`` [N m]."""
         last, held = (stretch, np.zeros(self.n_a)) if self._bent is None else self._bent
-        most = 0.5 * self.losses.hysteresis * np.abs(self.stiffness * stretch)
+        most = 0.5 * self._p.hysteresis * np.abs(self.stiffness * stretch)
         held = np.clip(held + self.stiffness * (stretch - last), -most, most)
         self._bent = stretch, held
         return held
@@ -250,9 +261,9 @@ class Transmission:
 
     def age(self, q: Array, motor: Array, duration: float) -> None:
         """Creep: ``da0/dt = creep * torque`` for every tendon."""
-        if self.creep > 0:
+        if (creep := self._p.tendon_creep) > 0:
             torque = self.actuator_torque(q, motor)
-            self.offset = self.offset + self.creep * duration * torque * self._pulls_only[: self.n_a]
+            self.offset = self.offset + creep * duration * torque * self._pulls_only[: self.n_a]
 
     def take_over(self, other: Transmission, q: Array, motor: Array) -> None:
         """Go on from another transmission without a jolt: each actuator turns its joints as hard as
@@ -260,7 +271,7 @@ class Transmission:
         along = np.einsum("aq,aq->a", self._lead, other._lead) / np.einsum("aq,aq->a", self._lead, self._lead)
         stretch = self.stretched(along * other._pull(other.stretch(q, motor)))
         self.offset = self.offset + self.stretch(q, motor) - stretch
-        half = self.losses.play / 2
+        half = self.play / 2
         self._anchor, self._lean, self._bent = other._anchor, np.clip(other._lean, -half, half), None
 
 

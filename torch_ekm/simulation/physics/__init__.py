@@ -1,1 +1,1 @@
-"""SAPIEN: bodies, contacts, time."""
+"""SAPIEN and MuJoCo: bodies, contacts, time."""

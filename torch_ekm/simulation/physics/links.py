@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,19 +21,33 @@ JOINT_DAMPING = 5e-3  # [N m s/rad]; the softest freedom (springs alone) settles
 class MovingLink:
     """A link on a joint, or the root (without parent and joint), with all that is fixed to it.
 
-    ``placed`` is the joint's frame in the parent's, or the root's in the hand frame; ``shapes`` have
-    their frame in this link's and the name of the URDF's link to which they belong. Mass [kg], centre of mass
-    [m] and inertia about it [kg m^2] are in this link's frame.
+    ``placed`` is the joint's frame in the parent's, or the root's in the hand frame; ``pieces`` are the
+    URDF's links, each with its frame in this one's.
     """
 
     name: str
     parent: str | None
     joint: UrdfJoint | None
     placed: Array
-    shapes: list[tuple[Array, Shape, str]] = field(default_factory=list)
-    mass: float = 0.0
-    com: Array = field(default_factory=lambda: np.zeros(3))
-    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    pieces: list[tuple[Array, UrdfLink]] = field(default_factory=list)
+
+    @property
+    def shapes(self) -> Iterator[tuple[Array, Shape, str]]:
+        """Frame in this link's, shape, and the name of the URDF's link to which it belongs."""
+        for placed, piece in self.pieces:
+            yield from ((placed @ shape.transform, shape, piece.name) for shape in piece.collisions)
+
+    def body(self) -> tuple[float, Array, Array]:
+        """Mass [kg], centre of mass [m] and inertia about it [kg m^2], in this link's frame."""
+        mass, first, about_frame = 0.0, np.zeros(3), np.zeros((3, 3))
+        for placed, piece in self.pieces:
+            rotation = placed[:3, :3]
+            centre = rotation @ piece.com + placed[:3, 3]
+            mass += piece.mass
+            first += piece.mass * centre
+            about_frame += rotation @ piece.inertia @ rotation.T + piece.mass * _steiner(centre)
+        com = first / mass if mass > 0 else first
+        return mass, com, about_frame - mass * _steiner(com)
 
 
 def moving_links(hand: HandDescription) -> list[MovingLink]:
@@ -47,42 +62,22 @@ def moving_links(hand: HandDescription) -> list[MovingLink]:
             problem = f"link '{pad.link}' carries the pad '{pad.name}', and its only <collision> is a mesh"
             remedy = "write the pad's capsule there: contacts need box, cylinder, sphere or capsule"
             raise DescriptionError(hand.urdf_path, f"{problem}; {remedy}")
-    root = urdf.root
-    links = {root: MovingLink(root, None, None, np.eye(4))}
-    carrier: dict[str, tuple[str, Array]] = {root: (root, np.eye(4))}
-    parts: dict[str, list[tuple[Array, UrdfLink]]] = {root: [(np.eye(4), urdf.link(root))]}
+    root = MovingLink(urdf.root, None, None, np.eye(4))
+    links, carrier = [root], {urdf.root: (root, np.eye(4))}
     for joint in sorted(urdf.joints, key=lambda joint: len(urdf.joints_to(joint.parent))):
         owner, offset = carrier[joint.parent]
-        placed, child = offset @ joint.transform, urdf.link(joint.child)
-        if joint.kind == "fixed":
-            carrier[joint.child] = (owner, placed)
-            parts[owner].append((placed, child))
-            continue
-        carrier[joint.child] = (joint.child, np.eye(4))
-        parts[joint.child] = [(np.eye(4), child)]
-        links[joint.child] = MovingLink(joint.child, owner, joint, placed)
+        placed = offset @ joint.transform
+        if joint.kind != "fixed":
+            owner, placed = MovingLink(joint.child, owner.name, joint, placed), np.eye(4)
+            links.append(owner)
+        carrier[joint.child] = owner, placed
+    for name, (owner, placed) in carrier.items():
+        owner.pieces.append((placed, urdf.link(name)))
     owner, base = carrier[hand.base_link]
-    if owner != root:
+    if owner is not root:
         raise DescriptionError(hand.urdf_path, f"the base link '{hand.base_link}' must not move with a joint")
-    links[root].placed = np.asarray(np.linalg.inv(base), dtype=np.float64)
-    for name, link in links.items():
-        _fill(link, parts[name])
-    return list(links.values())
-
-
-def _fill(link: MovingLink, pieces: list[tuple[Array, UrdfLink]]) -> None:
-    first, about_frame = np.zeros(3), np.zeros((3, 3))
-    for placed, piece in pieces:
-        link.shapes += [(placed @ shape.transform, shape, piece.name) for shape in piece.collisions]
-        if piece.mass > 0:
-            rotation = placed[:3, :3]
-            centre = rotation @ piece.com + placed[:3, 3]
-            link.mass += piece.mass
-            first += piece.mass * centre
-            about_frame += rotation @ piece.inertia @ rotation.T + piece.mass * _steiner(centre)
-    if link.mass > 0:
-        link.com = first / link.mass
-        link.inertia = about_frame - link.mass * _steiner(link.com)
+    root.placed = np.asarray(np.linalg.inv(base), dtype=np.float64)
+    return links
 
 
 def principal(inertia: Array) -> tuple[Array, Array]:

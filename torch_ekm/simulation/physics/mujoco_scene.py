@@ -63,7 +63,8 @@ class MujocoScene:
             # of a name of its own: that of an MJCF is MuJoCo's own "world"
             bodies[link.name] = body = parent.add_body(name=f"link/{link.name}", gravcomp=1.0)
             body.pos, body.quat = link.placed[:3, 3], self._quaternion(link.placed[:3, :3])
-            self._set_mass(body, max(link.mass, _LEAST_MASS), link.com, link.inertia)
+            mass, com, inertia = link.body()
+            self._set_mass(body, max(mass, _LEAST_MASS), com, inertia)
             if link.joint is not None:
                 low, high = np.clip([link.joint.lower, link.joint.upper], -2 * np.pi, 2 * np.pi)
                 body.add_joint(

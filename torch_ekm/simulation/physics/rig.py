@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,11 @@ from ..mechanism.assembly import chain, make_transmission, true_object
 from ..mechanism.servo import Servo
 from ..parameters import PlantParameters
 from ..sensors import TimedState
-from .scene import make_scene
+from .mujoco_scene import MujocoScene
+from .sapien_scene import SapienScene
+from .scene import Scene
 
+_SCENES = {"sapien": SapienScene, "mujoco": MujocoScene}
 _FORCE_WINDOW = 10  # steps over which a fingertip force is averaged
 _OFTEN = 0.01  # [s] between two states that a late camera may show
 _STILL = 2e-3  # [rad/s] and [m/s x 10]: slower than this is settled
@@ -27,32 +31,25 @@ _FURTHER = 0.5  # longest further wait for a still object [s]
 _CLOSING, _HOLDING, _SETTLING = 0.2, 0.3, 1.0  # [s] of a grasp, object held fixed in the first two
 
 
+@dataclass(eq=False)
 class Rig:
-    """Steps the scene with the transmission's torques while the servos move, and measures the contact forces.
+    """Steps the scene with the transmission's torques while the servos move, and measures contact forces."""
 
-    Args:
-        hand, obj: the bodies.
-        config: time steps and rates.
-        parameters: what they really are.
-        remember: called every 0.01 s if the camera is late.
-        engine: which physics, one of :data:`ENGINES`.
-    """
+    hand: HandDescription
+    obj: ObjectDescription
+    config: PlantConfig
+    parameters: PlantParameters
+    """What hand and object really are."""
+    remember: Callable[[TimedState], None]
+    """Called every 0.01 s if the camera is late."""
+    engine: str
+    """Which physics, one of :data:`ENGINES`."""
 
-    def __init__(
-        self,
-        hand: HandDescription,
-        obj: ObjectDescription,
-        config: PlantConfig,
-        parameters: PlantParameters,
-        remember: Callable[[TimedState], None],
-        engine: str,
-    ) -> None:
-        self.hand, self.obj, self.config, self.parameters = hand, obj, config, parameters
-        self.remember, self.engine = remember, engine
-        self.transmission = make_transmission(hand, parameters)
-        self.servo = Servo(
-            hand.actuator_lower, hand.actuator_upper, parameters, config.relative_to, hand.actuator_backlash
-        )
+    def __post_init__(self) -> None:
+        hand, config = self.hand, self.config
+        self.transmission = make_transmission(hand, self.parameters)
+        limits = hand.actuator_lower, hand.actuator_upper
+        self.servo = Servo(*limits, self.parameters, config.relative_to, hand.actuator_backlash)
         self.time = 0.0
         """[s] since the fingers closed."""
         self.normal = np.zeros(len(hand.pads))
@@ -69,7 +66,7 @@ class Rig:
     def _build(self) -> None:
         p = self.parameters
         obj, step = true_object(self.obj, p), self.config.time_step
-        self.scene = make_scene(self.engine, self.hand, obj, step, p.contact_stiffness)
+        self.scene: Scene = _SCENES[self.engine](self.hand, obj, step, p.contact_stiffness)
         self._set_friction()
         self.scene.set_link_weight(p.link_weight)
         self._built_scale = p.object_scale

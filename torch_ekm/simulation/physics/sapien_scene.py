@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,25 +21,15 @@ _CONTACT_OFFSET = 0.0005  # [m]; at the default 10 mm friction acts on points th
 _HAND_GROUP = 1  # bodies that share a bit of the third collision word ignore each other
 _TORQUE_LIMIT = 100.0  # [N m]; a limit that never acts
 
-_engine: Any = None  # PhysX allows one engine in a process and drops it with its last reference
 
-
-def sapien() -> Any:
-    """The module ``sapien``, with its engine made for small things.
-
-    SAPIEN warns at import when the system has no Vulkan; the scenes here have no renderer, so that
-    warning is kept quiet.
-
-    Raises:
-        MissingExtraError: sapien is not installed.
-    """
-    global _engine
+@cache
+def _sapien() -> tuple[Any, Any]:
+    """The module ``sapien``, and its engine, made for small things: PhysX allows one in a process, and drops
+    it with its last reference."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*[Vv]ulkan.*")
+        warnings.filterwarnings("ignore", message=".*[Vv]ulkan.*")  # which only a renderer needs
         module = require("sapien")
-    if _engine is None:
-        _engine = module.physx.PhysxEngine(_TOLERANCE_LENGTH, _TOLERANCE_SPEED)
-    return module
+    return module, module.physx.PhysxEngine(_TOLERANCE_LENGTH, _TOLERANCE_SPEED)
 
 
 class SapienScene:
@@ -51,7 +42,8 @@ class SapienScene:
     def __init__(
         self, hand: HandDescription, obj: ObjectDescription, time_step: float, contact_stiffness: float
     ) -> None:
-        self._sapien, self._physx = sapien(), sapien().physx
+        self._sapien, _ = _sapien()
+        self._physx = self._sapien.physx
         self.time_step = time_step
         self._configure(hand)
         self._system: Any = self._physx.PhysxCpuSystem()
@@ -112,8 +104,9 @@ class SapienScene:
         for link in links:
             for at, shape, name in link.shapes:
                 self._link_of[self._attach(components[link.name], at, shape, _HAND_GROUP)] = name
-            if link.mass > 0:
-                self._set_mass(components[link.name], link.mass, link.com, link.inertia)
+            mass, com, inertia = link.body()
+            if mass > 0:
+                self._set_mass(components[link.name], mass, com, inertia)
         for entity in entities:
             self._scene.add_entity(entity)
         self._hand: Any = components[links[0].name].articulation

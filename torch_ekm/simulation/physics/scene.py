@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from ...description import HandDescription, ObjectDescription
+from ...description import ObjectDescription
 from ...typing import Array
 
 ENGINES = {"sapien": "SAPIEN", "mujoco": "MuJoCo"}
@@ -15,7 +15,13 @@ class Scene(Protocol):
     """A fixed hand and one free object; hand frame = world frame, SI units.
 
     Physics only, nothing of transmissions, servos or sensors: each joint has one drive of a given stiffness,
-    which is integrated implicitly and aims at a target that :meth:`step` is given.
+    which is integrated implicitly and aims at a target that :meth:`step` is given. An engine makes one of the
+    hand, whose URDF gives links, inertias and shapes, the object as it really is, the time step [s], and the
+    stiffness of each contact [N/m]; 0: as rigid as the engine has it.
+
+    Raises:
+        MissingExtraError: the engine is not installed.
+        DescriptionError: what stands in the hand's URDF cannot be simulated.
     """
 
     time_step: float
@@ -74,32 +80,3 @@ class Scene(Protocol):
         ...
 
     def restore(self, state: bytes) -> None: ...
-
-
-def make_scene(
-    engine: str,
-    hand: HandDescription,
-    obj: ObjectDescription,
-    time_step: float,
-    contact_stiffness: float,
-) -> Scene:
-    """The scene of an engine.
-
-    Args:
-        engine: one of :data:`ENGINES`.
-        hand: its URDF gives links, inertias and shapes.
-        obj: as it really is.
-        time_step: [s].
-        contact_stiffness: of each contact [N/m]; 0: as rigid as the engine has it.
-
-    Raises:
-        MissingExtraError: it is not installed.
-        DescriptionError: what stands in the hand's URDF cannot be simulated.
-    """
-    if engine == "sapien":
-        from .sapien_scene import SapienScene
-
-        return SapienScene(hand, obj, time_step, contact_stiffness)
-    from .mujoco_scene import MujocoScene
-
-    return MujocoScene(hand, obj, time_step, contact_stiffness)

@@ -1,4 +1,4 @@
-"""How a transmission departs from round pulleys, linear springs and cables without losses."""
+"""How a transmission departs from round pulleys and linear springs."""
 
 from __future__ import annotations
 
@@ -47,30 +47,3 @@ class JointShape:
     def spring(self, x: Array) -> Array:
         """``x (1 + s x^2)`` ``(*batch, n_q)`` [rad]; of a linear spring x itself."""
         return x if self.stiffening == 0 else x * (1 + self.stiffening * x**2)
-
-
-@dataclass(frozen=True)
-class CableLosses:
-    """Friction, hysteresis and coupling of the transmissions, and play of the joints::
-
-        |tau_f| <= friction + capstan |arm^T T|             Coulomb friction of the joint and of its cables
-        T  = K s + z,  |z| <= (hysteresis/2) k |s|,  dz = k ds while it may grow
-        K^-1 = D (I + coupling (1 1^T - I)) D,  D = diag(k)^(-1/2)
-        no torque goes through a joint while it is within its play
-
-    Source: a cable round a pulley over the angle w loses the share ``1 - exp(-mu w)`` of its tension (Euler
-    and Eytelwein): capstan; the elastic hysteresis is that of Masing (1926) with one element; actuators on
-    one frame that gives way are springs in series with a common one: coupling.
-    """
-
-    capstan: float
-    hysteresis: float
-    coupling: float
-    play: Array
-    """Full width of each joint ``(n_q,)`` [rad]."""
-
-    def compliance(self, stiffness: Array) -> Array:
-        """``K^-1`` ``(n_a, n_a)`` [rad/(N m)] of actuators with stiffness k ``(n_a,)`` [N m/rad]."""
-        root = 1 / np.sqrt(stiffness)
-        shared = self.coupling + (1 - self.coupling) * np.eye(len(stiffness))
-        return root[:, None] * shared * root
