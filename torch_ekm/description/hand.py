@@ -122,17 +122,14 @@ class HandDescription:
     """What closes chains, and joints that follow others along a curve."""
 
     def __post_init__(self) -> None:
-        if self.planar_normal is not None:
-            self._check_plane(np.array(self.planar_normal, dtype=float))
-
-    def _check_plane(self, normal: Array) -> None:
-        """Joints that turn about the normal turn no axis away from it: one posture is enough."""
-        size = float(np.linalg.norm(normal))
+        if self.planar_normal is None:
+            return
+        size = float(np.linalg.norm(self.planar_normal))
         if not 1e-9 < size < np.inf:
             problem = f"planar_normal must not be zero, and finite, got {self.planar_normal}"
             raise DescriptionError(self.transmission_path, problem)
-        normal = self.urdf.pose(self.base_link)[:3, :3] @ normal / size
-        for joint in self.urdf.moving_joints:
+        normal = self.urdf.pose(self.base_link)[:3, :3] @ np.array(self.planar_normal, dtype=float) / size
+        for joint in self.urdf.moving_joints:  # which turn no axis away from it: one posture is enough
             axis = self.urdf.pose(joint.child)[:3, :3] @ joint.axis
             lean = float(np.linalg.norm(np.cross(axis, normal)))
             if lean > 1e-3:

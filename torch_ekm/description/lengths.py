@@ -56,9 +56,7 @@ class ArmFunction:
     def typical(self, lower: float, upper: float) -> float:
         """The mean arm over a joint's range, which makes its stroke right; where it is next to nothing, the
         largest."""
-        arms = self(np.linspace(max(lower, -np.pi), min(upper, np.pi), _SAMPLES))[1]
-        mean, largest = float(arms.mean()), float(arms[np.abs(arms).argmax()])
-        return mean if abs(mean) > _LEAST * abs(largest) else largest
+        return float(_typical(self(np.linspace(max(lower, -np.pi), min(upper, np.pi), _SAMPLES))[1]))
 
 
 class Routed(Protocol):
@@ -228,7 +226,11 @@ def typical_arms(routed: Routed, lower: Array, upper: Array, rest: Array) -> Arr
     """Mean arms ``(n, n_q)`` of lengths on ways of their own; never 0 where they have any."""
     low, high = np.maximum(lower, rest - np.pi), np.minimum(upper, rest + np.pi)
     draw = np.random.default_rng(0).uniform(size=(_SAMPLES, len(low)))
-    J = np.stack([routed(q)[1] for q in [rest, *(low + draw * (high - low))]])
-    mean, largest = J.mean(axis=0), np.take_along_axis(J, np.abs(J).argmax(axis=0)[None], axis=0)[0]
-    found: Array = np.where(np.abs(mean) > _LEAST * np.abs(largest), mean, largest)
+    found = _typical(np.stack([routed(q)[1] for q in [rest, *(low + draw * (high - low))]]))
     return np.where(np.abs(found) > 1e-12, found, 0.0)
+
+
+def _typical(arms: Array) -> Array:
+    """The mean of arms at several postures ``(n, ...)``; where it is next to nothing, the largest."""
+    mean, largest = arms.mean(axis=0), np.take_along_axis(arms, np.abs(arms).argmax(axis=0)[None], axis=0)[0]
+    return np.where(np.abs(mean) > _LEAST * np.abs(largest), mean, largest)

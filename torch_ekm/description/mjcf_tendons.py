@@ -31,15 +31,12 @@ class RoutedTendons:
     """
 
     def __init__(self, model: Any, weights: Sequence[Mapping[int, float]], hinges: Sequence[int]) -> None:
+        self._given = model, weights, hinges
         self._model, self._tendons = model, sorted({t for row in weights for t in row})
         self._weights = np.array([[row.get(t, 0.0) for t in self._tendons] for row in weights])
-        self._q = [int(model.jnt_qposadr[j]) for j in hinges]
-        self._place = {int(model.jnt_dofadr[j]): k for k, j in enumerate(hinges)}
-        self._begin()
-
-    def _begin(self) -> None:
+        self._q, self._v = model.jnt_qposadr[list(hinges)], model.jnt_dofadr[list(hinges)]
         self._mj = require("mujoco")
-        self._data = self._mj.MjData(self._model)
+        self._data = self._mj.MjData(model)
 
     def __call__(self, q: Array) -> tuple[Array, Array]:
         mj, model, data = self._mj, self._model, self._data
@@ -47,20 +44,12 @@ class RoutedTendons:
         mj.mj_kinematics(model, data)
         mj.mj_comPos(model, data)
         mj.mj_tendon(model, data)
-        J = np.zeros((len(self._tendons), len(self._q)))
-        for row, t in zip(J, self._tendons, strict=True):
-            first = int(model.ten_J_rowadr[t])
-            for i in range(first, first + int(model.ten_J_rownnz[t])):
-                if (place := self._place.get(int(model.ten_J_colind[i]))) is not None:
-                    row[place] += data.ten_J[i]
-        return self._weights @ data.ten_length[self._tendons], self._weights @ J
+        J = np.zeros((model.ntendon, model.nv))
+        mj.mju_sparse2dense(J, data.ten_J, model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind)
+        return self._weights @ data.ten_length[self._tendons], self._weights @ J[self._tendons][:, self._v]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> RoutedTendons:
         return self  # only what it measures with changes
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("_mj", "_data")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._begin()
+    def __reduce__(self) -> tuple[type[RoutedTendons], tuple[Any, ...]]:
+        return RoutedTendons, self._given

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 
 import numpy as np
 
@@ -90,19 +89,21 @@ class Transmission:
         self._any_tendon, self._any_play = bool(self._pulls_only.any()), bool(play.any())
         self.spring_stiffness, self.spring_rest = hand.spring_stiffness, hand.spring_rest
         self.friction = hand.joint_friction
-        self.shape, self.play, self._p, self.law = (
-            shape,
-            play,
-            parameters,
-            copy.deepcopy(parameters.joint_law),
-        )
+        self.shape, self.play, self._p = shape, play, parameters
+        self.law = copy.deepcopy(parameters.joint_law)
         self._followed = (self.J_a - self._lead) @ shape.excursion(self.spring_rest)
         self._apart = self._M[self.n_a :] @ self.spring_rest
         rubs = (self.friction > 0) | ((parameters.cable_friction > 0) & self._lead.any(axis=0))
         self._k_f = np.where(rubs, _BRISTLE_STIFFNESS, 0.0)
         self._bends = self._reach(self.friction)
         varied = 1.0 if self._lengths is None else hand.lengths.largest(*limits)
-        tied = list(self._tied(limits))
+        tied = []
+        if (springs := hand.tendon_springs) is not None:
+            tied.append((springs.stiffness, springs.lengths.typical * springs.lengths.largest(*limits)))
+        if (loops := hand.loops) is not None:
+            arms = loops.lengths.typical * loops.lengths.largest(*limits)
+            self._k_l = _LOOP_STIFFNESS / (arms**2).max(axis=1)
+            tied.append((self._k_l, arms))
         strong = [(stiffness, self.J_a * varied), (self._k[self.n_a :], self._M[self.n_a :]), *tied]
         self.stiff = bool(max((k[:, None] * arms**2).max(initial=0.0) for k, arms in strong) > _STIFF)
         """Some actuator is: :meth:`drive_targets` takes the joints as they will be after the step."""
@@ -130,17 +131,6 @@ class Transmission:
         tied = [{hand.joint_names[joint] for joint in np.flatnonzero(row)} for row in coupling]
         linkage = [len(tie) > 1 and any(tie <= finger for finger in fingers) for tie in tied]
         return np.where(linkage, _LOOP_STIFFNESS, between)
-
-    def _tied(self, limits: tuple[Array, Array]) -> Iterator[tuple[Array, Array]]:
-        """Stiffnesses and largest arms of tendon springs and loops."""
-        if self._springs is not None:
-            lengths = self._springs.lengths
-            yield self._springs.stiffness, lengths.typical * lengths.largest(*limits)
-        if self._loops is not None:
-            lengths = self._loops.lengths
-            arms = lengths.typical * lengths.largest(*limits)
-            self._k_l = _LOOP_STIFFNESS / (arms**2).max(axis=1)
-            yield self._k_l, arms
 
     def length(self, q: Array) -> Array:
         """``l(q)`` of the actuators, ``(*batch, n_a)``, with followers where they are."""
