@@ -12,8 +12,7 @@ import pytest
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.simulation import PlantParameters, SimulatedHand
 from torch_ekm.simulation.mechanism.assembly import make_transmission
-from torch_ekm.simulation.mechanism.joint_shape import JointShape
-from torch_ekm.simulation.mechanism.transmission import Transmission, coupled_posture
+from torch_ekm.simulation.mechanism.transmission import JointShape, Transmission, coupled_posture
 from torch_ekm.simulation.sensors import Sensors
 
 HAND = load_hand("icub_right")

@@ -48,6 +48,7 @@ class MjcfTransmission:
         joints = self.urdf.moving_joints
         self.lower = np.array([joint.lower for joint in joints])
         self.upper = np.array([joint.upper for joint in joints])
+        self._rest = self.model.qpos_spring[self.model.jnt_qposadr[self.hinges]]
         self._drives: list[Array] = []
         self._loops: list[dict[str, Any]] = []
         self._used: set[int] = set()
@@ -72,13 +73,12 @@ class MjcfTransmission:
             self.note(note, tie[0])
         self._note_unread()
         rests, couplings = self._rests(couplings)
+        friction = self.model.dof_frictionloss[self.model.jnt_dofadr[self.hinges]]
+        figures = np.stack([self.model.jnt_stiffness[self.hinges], rests, friction], axis=1).tolist()
+        keys = "spring", "rest", "friction"
         joints = {
-            self.names[j]: {
-                "spring": float(self.model.jnt_stiffness[j]),
-                "rest": float(rests[k]),
-                "friction": float(self.model.dof_frictionloss[self.model.jnt_dofadr[j]]),
-            }
-            for k, j in enumerate(self.hinges)
+            name: dict(zip(keys, of, strict=True))
+            for name, of in zip(self.names.values(), figures, strict=True)
         }
         tied = [{"name": label, "joints": self._named(row)} for label, row, _ in couplings]
         tables = {"joints": joints, "actuators": actuators, "couplings": tied}
@@ -87,20 +87,17 @@ class MjcfTransmission:
     def _rests(self, couplings: list[_Tie]) -> tuple[Array, list[_Tie]]:
         """Where springs are slack, joints without a spring at angles that obey the couplings; and these. One
         that springs at rest do not obey is a loop with a value of its own."""
-        rests = self._rest()
+        rests = self._rest.copy()
         if not couplings:
             return rests, couplings
         C, length = np.array([row for _, row, _ in couplings]), np.array([value for *_, value in couplings])
-        loose = np.array([self.model.jnt_stiffness[j] == 0 for j in self.hinges])
+        loose = self.model.jnt_stiffness[self.hinges] == 0
         rests[loose] += np.linalg.pinv(C[:, loose]) @ (length - C @ rests)
         off = np.abs(length - C @ rests) > _OFF
         for apart, (name, row, value) in zip(off, couplings, strict=True):
             if apart:
                 self._loops.append({"name": name, "moment_arms": self._named(row), "value": value})
         return rests, [one for apart, one in zip(off, couplings, strict=True) if not apart]
-
-    def _rest(self) -> Array:
-        return np.array([self.model.qpos_spring[self.model.jnt_qposadr[j]] for j in self.hinges])
 
     # -- actuators ----------------------------------------------------------------------------------
 
@@ -201,7 +198,7 @@ class MjcfTransmission:
         """Moment arms ``(n_q,)`` and length at zero angles of a fixed tendon; of others typical arms, 0."""
         routed = RoutedTendons(self.model, [{t: 1.0}], self.hinges)
         if not self._is_fixed(t):
-            return typical_arms(routed, self.lower, self.upper, self._rest())[0], 0.0
+            return typical_arms(routed, self.lower, self.upper, self._rest)[0], 0.0
         length, arms = routed(np.zeros(len(self.hinges)))
         return arms[0], float(length[0])
 
@@ -287,8 +284,7 @@ class MjcfTransmission:
     def _tied(self, kind: int, which: int) -> tuple[Array, float]:
         """The row of a joint or tendon under an equality, and its value where MuJoCo counts from."""
         if kind == self._mj.mjtEq.mjEQ_JOINT:
-            row = self._unit(which)
-            return row, self._start(which) if row.any() else 0.0
+            return self._unit(which), self._start(which) if which in self.hinges else 0.0
         row, offset = self._tendon(which)
         return row, float(self.model.tendon_length0[which]) - offset
 

@@ -9,8 +9,7 @@ import numpy as np
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import ParameterError
 from ..parameters import PlantParameters
-from .joint_shape import JointShape
-from .transmission import Transmission
+from .transmission import JointShape, Transmission
 
 _RIGID = 100.0  # [N m/rad] at a joint: 0.3 to 0.4 % of a motion from rigid; stiffer settles worse at 1 ms
 
