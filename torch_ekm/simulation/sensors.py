@@ -59,7 +59,7 @@ class Sensors:
     def forget(self) -> None:
         """A new grasp: no old frames, no hysteresis."""
         self._frames: deque[TimedState] = deque()
-        self._seen: tuple[Array, Array, float] | None = None
+        self._seen: TimedState | None = None
         self._felt = np.zeros(self.n_pads)
         self._stuck_at: Array | None = None
 
@@ -73,11 +73,22 @@ class Sensors:
         """What the camera's picture shows that is to be had now."""
         return self._frames[0] if self._p.latency > 0 and self._frames else now
 
-    def frame(self, now: TimedState, generator: np.random.Generator) -> TimedState:
-        """Joints and pose as the sensors have them, of the time of the picture; an old one if it is lost."""
-        q = self.joints(now.q, generator)
-        position, rotation, taken, _ = self.pose(self.pictured(now), generator)
-        return TimedState(taken, q, position, rotation)
+    def frame(self, now: TimedState, generator: np.random.Generator) -> tuple[TimedState, bool]:
+        """Joints and pose as the sensors have them, of the time of the picture, and whether the camera saw
+        the object this time: else its pose is an old one. Joints of stuck channels do not change."""
+        p = self._p
+        q = now.q + p.joint_noise * generator.standard_normal(self.n_q)
+        if self._stuck_at is None:
+            self._stuck_at = q
+        q = np.where(self._stuck, self._stuck_at, q)
+        noise, turn, luck = generator.standard_normal(3), generator.standard_normal(3), generator.random()
+        last, seen = self._seen, luck >= p.frame_loss
+        if last is None or seen:  # the first frame of a grasp is waited for
+            picture = self.pictured(now)
+            shaken = exp(torch.from_numpy(p.rotation_noise * turn)).numpy() @ picture.rotation
+            last = TimedState(picture.time, q, picture.position + p.position_noise * noise, shaken)
+            self._seen, seen = last, True
+        return last._replace(q=q), seen
 
     def agree(self, one: TimedState, other: TimedState) -> bool:
         """Whether two frames differ by their noise: joints, and pose, each by the mean square of what they
@@ -88,28 +99,6 @@ class Sensors:
         pose = np.concatenate([turned / angle, (other.position - one.position) / length])
         joints = (other.q - one.q) / max(p.joint_noise, _LEAST_ANGLE)
         return all(np.mean(z**2) / 2 <= 1 + np.sqrt(2 / len(z)) for z in (pose, joints))
-
-    def joints(self, q: Array, generator: np.random.Generator) -> Array:
-        """Joint angles ``(n_q,)`` [rad] with noise; those of stuck channels do not change."""
-        reading = q + self._p.joint_noise * generator.standard_normal(self.n_q)
-        if self._stuck_at is None:
-            self._stuck_at = reading.copy()
-        return np.where(self._stuck, self._stuck_at, reading)
-
-    def pose(self, picture: TimedState, generator: np.random.Generator) -> tuple[Array, Array, float, bool]:
-        """Estimated object pose in the hand frame [m], when its picture was taken [s], and whether the camera
-        saw it this time.
-
-        Args:
-            picture: as :meth:`pictured`.
-        """
-        p = self._p
-        noise, turn, luck = generator.standard_normal(3), generator.standard_normal(3), generator.random()
-        if self._seen is not None and luck < p.frame_loss:  # the first frame of a grasp is waited for
-            return *self._seen, False
-        shaken = exp(torch.from_numpy(p.rotation_noise * turn)).numpy() @ picture.rotation
-        self._seen = (picture.position + p.position_noise * noise, shaken, picture.time)
-        return *self._seen, True
 
     def forces(self, normal: Array, time: float, generator: np.random.Generator) -> Array:
         """Estimated normal force of each pad ``(n_pads,)`` [N], ``time`` after the grasp [s]."""

@@ -172,20 +172,21 @@ class SimulatedHand:
         rig, draw = self._grasped(), self._generator
         _, q, position, rotation = now = rig.state
         status = self.status
-        joints, picture = self._sensors.joints(q, draw), self._sensors.pictured(now)
-        seen_position, seen_rotation, taken, seen = self._sensors.pose(picture, draw)
-        force = self._sensors.forces(rig.normal, rig.time, draw)
+        frame, seen = self._sensors.frame(now, draw)
+        picture = self._sensors.pictured(now)
+        felt = self._sensors.forces(rig.normal, rig.time, draw)
         if not seen and status is PlantStatus.HELD:
             status = PlantStatus.NOT_SEEN
         torque = rig.transmission.actuator_torque(q, rig.servo.output)
         pictured = GraspState(*_tensors(picture.q, picture.position, picture.rotation))
-        q_seen, a, o, R, measured = _tensors(joints, rig.servo.encoder, seen_position, seen_rotation, force)
+        *read, force = _tensors(frame.q, rig.servo.encoder, frame.position, frame.rotation, felt)
         return Observation(
-            *(q_seen, a, o, R, measured if self.parameters.force_sensors else None),
+            *read,
+            fingertip_force=force if self.parameters.force_sensors else None,
             time=rig.time,
             status=status,
             truth=Truth(*_tensors(q, position, rotation, rig.normal, torque), pictured=pictured),
-            stamps=Stamps(rig.time, rig.time, taken, rig.time),
+            stamps=Stamps(rig.time, rig.time, frame.time, rig.time),
         )
 
     def close(self) -> None:
@@ -284,7 +285,7 @@ class SimulatedHand:
         moved = rig.time
         while rig.time < moved + _LONGEST_REST:
             rig.wait(rig.to_frame * self.config.time_step)
-            frame = self._sensors.frame(rig.state, self._generator)
+            frame, _ = self._sensors.frame(rig.state, self._generator)
             if frame.time > (moved if before is None else before.time) + 1e-9:
                 if before is not None and self._sensors.agree(before, frame):
                     break
