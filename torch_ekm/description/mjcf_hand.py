@@ -121,16 +121,17 @@ class _Conversion:
                 continue
             parent, offset = frame[int(model.body_parentid[b])]
             at = offset @ self._pose(model.body_pos[b], model.body_quat[b])
-            kinds = [(j, int(model.jnt_type[j]) == self._kind.mjJNT_HINGE) for j in self._joints_of(b)]
-            hinges = [j for j, hinge in kinds if hinge]
-            self.held += [(model.joint(j).name or name, name) for j, hinge in kinds if not hinge]
+            own = np.flatnonzero(model.jnt_bodyid == b).tolist()
+            hinges = [j for j in own if model.jnt_type[j] == int(self._kind.mjJNT_HINGE)]
+            self.held += [(model.joint(j).name or name, name) for j in own if j not in hinges]
             for k, j in enumerate(hinges):
                 child = name if k == len(hinges) - 1 else f"{name}/{k + 1}"
                 joint = element_name(model, "joint", j)
                 anchor, axis, back = self._pose(model.jnt_pos[j]), model.jnt_axis[j], np.zeros(4)
                 self._mj.mju_axisAngle2Quat(back, axis, -model.qpos0[model.jnt_qposadr[j]])
                 placed = at @ anchor @ self._pose(np.zeros(3), back)
-                joints.append(UrdfJoint(joint, "revolute", parent, child, placed, axis, *self._limits(j)))
+                limits = model.jnt_range[j].tolist() if model.jnt_limited[j] else (-np.inf, np.inf)
+                joints.append(UrdfJoint(joint, "revolute", parent, child, placed, axis, *limits))
                 self.hinges.append(j)
                 self.names[j] = joint
                 parent, at = child, self._pose(-model.jnt_pos[j])
@@ -162,16 +163,6 @@ class _Conversion:
         floats = [int(self._kind.mjJNT_FREE)]
         found = {root for root, on_it in kinds.items() if (root not in driven if driven else on_it == floats)}
         return {body for body in bodies if int(model.body_rootid[body]) in found}
-
-    def _joints_of(self, body: int) -> range:
-        first = int(self.model.body_jntadr[body])
-        return range(first, first + int(self.model.body_jntnum[body]))
-
-    def _limits(self, joint: int) -> tuple[float, float]:
-        if not self.model.jnt_limited[joint]:
-            return -np.inf, np.inf
-        lower, upper = self.model.jnt_range[joint].tolist()
-        return lower, upper
 
     def _link(self, name: str, body: int, at: Array) -> UrdfLink:
         model = self.model
