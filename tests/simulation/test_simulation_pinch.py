@@ -233,6 +233,20 @@ def test_a_known_pinch_is_that_which_would_be_planned(monkeypatch):
     assert len(planned) == 5
 
 
+@pytest.mark.parametrize("away", [0.0, 1.0])
+def test_parts_that_are_clear_of_the_object_are_not_asked_for_a_derivative(away):
+    """The same Jacobian as with all of them, near the object and 1 m off."""
+    hand, obj, request = load_hand("icub_right"), load_object("can"), PinchRequest()
+    problem = pinch_problem(hand, obj, PlantConfig(), PlantParameters())
+    x = next(_guesses(problem, request))
+    x[len(problem.moving)] += away
+    clearance, steps = problem.geometry(x[None]).clearance, 1e-6 * np.eye(len(x))
+    assert (clearance < 0.002).any() == (away == 0)
+    values = problem.residuals(np.concatenate([x + steps, x - steps]), request, True)
+    expected = (values[: len(x)] - values[len(x) :]).T / 2e-6
+    np.testing.assert_array_equal(problem.jacobian(x, request, True), expected)
+
+
 def test_planning_takes_one_thread_and_gives_the_others_back(monkeypatch):
     hand, obj, request, seen = load_hand("icub_right"), load_object("can"), PinchRequest(), set()
     problem = pinch_problem(hand, obj, PlantConfig(), PlantParameters())

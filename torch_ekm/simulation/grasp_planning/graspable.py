@@ -56,3 +56,18 @@ def half_extent(obj: ObjectDescription, axis: Array) -> float:
         else:
             found = max(found, centre + float(local[2]) * length / 2 + radius)
     return found
+
+
+def opposition(tips: Array, directions: Array) -> tuple[Array, Array]:
+    """How well the first pad and the others face each other, cosines ``(b, c)``, and their distance ``(b,)``.
+
+    Args:
+        tips: centres of the pads' rounded ends ``(b, c, 3)`` [m].
+        directions: outward directions of their middles ``(b, c, 3)``.
+    """
+    across = tips[:, 1:].mean(axis=1) - tips[:, 0]
+    distance = np.linalg.norm(across, axis=1)
+    across /= distance[:, None]
+    facing = np.einsum("bci,bi->bc", directions, across)
+    facing[:, 1:] *= -1.0
+    return facing, distance

@@ -24,7 +24,8 @@ from ..config import PlantConfig
 from ..mechanism.assembly import chain, make_transmission, true_object
 from ..parameters import PlantParameters
 from .blame import BorneProblem, blame_geometry, blame_torque
-from .pinch_problem import PinchProblem, PinchRequest, opposition
+from .graspable import opposition
+from .pinch_problem import PinchProblem, PinchRequest
 from .requirements import closes_pad, direction_unmet, require_two_pads_and_limits
 
 _FACING = 0.7  # a pinch across the wished axis has 0.98 and more, one across another axis about 0
