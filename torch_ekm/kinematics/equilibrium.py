@@ -223,9 +223,7 @@ class ActuationMap(nn.Module):
             ShapeError: the last dimension is not ``n_a``; the message lists the actuators.
             EquilibriumError: none was found.
         """
-        at, found = self._rests(a)
-        q = np.array([rest.q for rest in found]).reshape(*at.shape[:-1], -1)
-        P = np.array([rest.projector for rest in found]).reshape(*q.shape, -1)
+        at, q, _, P = self._rests(a)
         return _along(a, at, q, P)
 
     def free_motion(self, a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_q n_a"]:
@@ -234,9 +232,7 @@ class ActuationMap(nn.Module):
         Raises:
             ShapeError, EquilibriumError: as :meth:`joints`.
         """
-        at, found = self._rests(a)
-        P = np.array([rest.projector for rest in found])
-        return torch.from_numpy(P.reshape(*at.shape[:-1], *P.shape[-2:])).to(self.J_a)
+        return torch.from_numpy(self._rests(a)[3]).to(self.J_a)
 
     def pull(self, a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
         """Force of each actuator along +a in the hand that touches nothing [N m]; 0 of slack tendons.
@@ -244,13 +240,15 @@ class ActuationMap(nn.Module):
         Raises:
             ShapeError, EquilibriumError: as :meth:`joints`.
         """
-        at, found = self._rests(a)
-        return torch.from_numpy(np.array([rest.pull for rest in found]).reshape(at.shape)).to(self.J_a)
+        return torch.from_numpy(self._rests(a)[2]).to(self.J_a)
 
-    def _rests(self, a: Tensor) -> tuple[np.ndarray, list[Rest]]:
+    def _rests(self, a: Tensor) -> tuple[Array, Array, Array, Array]:
+        """a, and the parts of :class:`Rest` of each of the batch."""
         self._check("a", a, self.hand.actuator_names)
         at = a.detach().double().cpu().numpy()
-        return at, [self._free(one) for one in at.reshape(-1, at.shape[-1])]
+        rests = zip(*map(self._free, at.reshape(-1, at.shape[-1])), strict=True)
+        q, pull, P = (np.array(part).reshape(*at.shape[:-1], *part[0].shape) for part in rests)
+        return at, q, pull, P
 
     def _check(self, name: str, value: Tensor, names: tuple[str, ...]) -> None:
         if value.dim() == 0 or value.shape[-1] != len(names):

@@ -31,9 +31,13 @@ class LinkPoses:
         Raises:
             UnknownNameError: there is no such link; the message lists all.
         """
-        if name not in self.link_names:
-            raise UnknownNameError("link", name, self.link_names)
-        return self.transforms[..., self.link_names.index(name), :, :]
+        return self.transforms[..., _place(name, self.link_names), :, :]
+
+
+def _place(name: str, names: tuple[str, ...]) -> int:
+    if name not in names:
+        raise UnknownNameError("link", name, names)
+    return names.index(name)
 
 
 @runtime_checkable
@@ -126,9 +130,7 @@ class HandKinematics(nn.Module):
         Raises:
             UnknownNameError: there is no such link; the message lists all.
         """
-        if name not in self.link_names:
-            raise UnknownNameError("link", name, self.link_names)
-        return self.link_names.index(name)
+        return _place(name, self.link_names)
 
     def forward(self, q: Float[Tensor, "*batch n_q"]) -> LinkPoses:
         """Poses of all links at joint angles ``q`` [rad]; a NaN angle gives NaN poses.

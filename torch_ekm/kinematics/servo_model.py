@@ -78,14 +78,11 @@ class Play:
         Raises:
             ShapeError: ``delta_a`` has not one entry per actuator.
         """
-        self._check(delta_a)
+        if delta_a.shape[-1:] != self.width.shape[-1:]:
+            expected = f"(*batch, {self.width.shape[-1]})"
+            raise ShapeError("delta_a", expected, delta_a.shape, "one entry per actuator")
         after = PlayState(self.at(state.low - delta_a).low, self.at(state.high - delta_a).low)
         return delta_a + after.position - state.position, after
-
-    def _check(self, increment: AnyArray) -> None:
-        if increment.shape[-1:] != self.width.shape[-1:]:
-            expected = f"(*batch, {self.width.shape[-1]})"
-            raise ShapeError("delta_a", expected, increment.shape, "one entry per actuator")
 
 
 Mask = NDArray[np.bool_]
