@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from .._checks import check_last
 from ..description import HandDescription
-from ..exceptions import EquilibriumError, ShapeError
+from ..exceptions import EquilibriumError
 from ..typing import Array, Float, Tensor
 
 _NEWTON = 60  # steps before the way of the motors is divided
@@ -251,9 +252,7 @@ class ActuationMap(nn.Module):
         return at, q, pull, P
 
     def _check(self, name: str, value: Tensor, names: tuple[str, ...]) -> None:
-        if value.dim() == 0 or value.shape[-1] != len(names):
-            hint = f"in order: {', '.join(names)}"
-            raise ShapeError(name, f"(*batch, {len(names)})", value.shape, hint)
+        check_last(name, value, len(names), f"in order: {', '.join(names)}")
 
     def extra_repr(self) -> str:
         return f"'{self.hand.name}', actuators={self.hand.n_a}, joints={self.hand.n_q}"

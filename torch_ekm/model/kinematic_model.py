@@ -328,16 +328,15 @@ class KinematicModel(nn.Module):
         A = constraint_matrix(kin)
         V_s, V_ss = self.potential(at)
         arms = arms_at(self.hand, at.q)
-        last, measured, before = None, None, () if previous is None else previous.contacts.finger
+        last, before, measured = None, () if previous is None else previous.contacts.finger, {}
         if fingertip_force is not None:
             measured = at_pads(self.hand, contacts, fingertip_force, at.q)
         if forces is None:
             if previous is not None and previous.forces.solved and before == contacts.finger:
                 last = previous.forces
-            readings = None if measured is None else [measured[finger] for finger in contacts.finger]
-            touch = None if readings is None else namespace(at.q).stack(readings, -1)
-            known = {"normal": touch, "expected": expected, "last": last}
-            forces = self.balance(at.q, kin, A, V_s, arms=arms, **known)
+            touch = [measured[finger] for finger in contacts.finger] if measured else None
+            normal = None if touch is None else namespace(at.q).stack(touch, -1)
+            forces = self.balance(at.q, kin, A, V_s, arms=arms, normal=normal, expected=expected, last=last)
 
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:

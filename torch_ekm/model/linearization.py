@@ -10,9 +10,8 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 from .._arrays import eye, in_numpy, in_torch, is_plain, like, norm, of_fields, zeros
-from .._checks import check_finite
+from .._checks import check_finite, check_last
 from ..contact.contact_set import ContactSet
-from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.tensors import as_tensors
 from ..typing import AnyArray, Bool, Float, Tensor
@@ -187,9 +186,7 @@ class Linearization:
 
     def _increment(self, delta_a: Tensor) -> Tensor:
         delta_a = as_tensors(delta_a=delta_a)[0].to(self.manipulation_jacobian)
-        n_a = self.manipulation_jacobian.shape[-1]
-        if delta_a.shape[-1:] != (n_a,):
-            raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
+        check_last("delta_a", delta_a, self.manipulation_jacobian.shape[-1], "one entry per actuator")
         check_finite("delta_a", delta_a)
         return delta_a
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from .._arrays import like, namespace, norm
-from .._checks import check_kind
+from .._checks import check_kind, check_last
 from ..contact.contact_set import LINK_MARGIN, ContactSet
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
@@ -45,9 +45,7 @@ def check_state(
     """One entry for each joint, contacts with a batch of states, everything in the model's precision."""
     if contacts is not None:
         check_kind("contacts", contacts, ContactSet, "a ContactSet, e.g. model.contacts(state)")
-    if state.q.shape[-1] != hand.n_q:
-        names = ", ".join(hand.joint_names)
-        raise ShapeError("q", f"(*batch, {hand.n_q})", state.q.shape, f"the joints are: {names}")
+    check_last("q", state.q, hand.n_q, f"the joints are: {', '.join(hand.joint_names)}")
     if contacts is None and state.q.dim() > 1:
         raise ShapeError("q", f"({hand.n_q},)", state.q.shape, "for a batch give the contacts too")
     for name, given in (("state", state.q), ("contacts", None if contacts is None else contacts.gap)):
@@ -88,10 +86,7 @@ def at_pads(
         valid = f"finite or NaN, and above {_LOWEST} N: a pad cannot pull (is its zero or its sign wrong?)"
         raise ParameterError("fingertip_force", fingertip_force.tolist(), valid)
     pads = [pad.name for pad in hand.pads]
-    if fingertip_force.shape[-1:] != (len(pads),):
-        raise ShapeError(
-            "fingertip_force", f"(*batch, {len(pads)})", fingertip_force.shape, f"pads: {', '.join(pads)}"
-        )
+    check_last("fingertip_force", fingertip_force, len(pads), f"pads: {', '.join(pads)}")
     measured = {name: fingertip_force[..., i] for i, name in enumerate(pads)}
     for name, link in zip(contacts.finger, contacts.link, strict=True):
         if name not in pads and name != link:
@@ -153,7 +148,7 @@ def find_doubts(
     forces: GraspForces,
     stability: Float[Tensor, "*batch"],
     reused: bool,
-    measured: dict[str, Any] | None = None,
+    measured: dict[str, Any],
     before: tuple[str, ...] = (),
 ) -> tuple[Doubt, ...]:
     """All that can be said against a state, worst kind first.
@@ -163,7 +158,6 @@ def find_doubts(
         measured: normal forces that the pads measure, by pad [N].
         before: the pads that touched a step before.
     """
-    measured = measured or {}
     doubts = [*_of_stability(stability, options), *_of_near_misses(contacts, measured, before, options)]
     if forces.solved:
         doubts += _of_torque(joint_names, forces, options)

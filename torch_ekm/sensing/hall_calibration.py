@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from .._checks import check_finite
+from .._checks import check_finite, check_last
 from ..exceptions import CalibrationError, ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 
@@ -141,8 +141,7 @@ class HallCalibration:
             ShapeError: the last dimension is not the number of channels.
             NonFiniteError: a reading is NaN.
         """
-        if readings.ndim == 0 or readings.shape[-1] != len(self.channels):
-            raise ShapeError("readings", f"(*batch, {len(self.channels)})", readings.shape)
+        check_last("readings", readings, len(self.channels))
         check_finite("readings", readings)
         channels = zip(self.channels, readings.to(torch.float64).unbind(-1), strict=True)
         columns = zip(*(channel.estimate(n) for channel, n in channels), strict=True)

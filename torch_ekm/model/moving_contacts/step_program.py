@@ -252,5 +252,5 @@ def mode_linearization(
         held_joints=torch.from_numpy(stop != 0),
         stability=stability,
         options=model.options,
-        doubts=find_doubts(model.options, laws.hand.joint_names, contacts, forces, stability, reused=False),
+        doubts=find_doubts(model.options, laws.hand.joint_names, contacts, forces, stability, False, {}),
     )
