@@ -214,10 +214,10 @@ def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOp
 
 
 def _of_friction(contacts: ContactSet, forces: GraspForces) -> Iterator[Doubt]:
-    least, margin = (as_states(x, 1).min(0).tolist() for x in (forces.relative_margin, forces.margin))
-    friction = contacts.friction.tolist()
-    for pad, value, left, mu_s in zip(contacts.finger, least, margin, friction, strict=True):
-        if value <= AT_LIMIT and mu_s > 0:
+    least = as_states(forces.relative_margin, 1).min(0).tolist()
+    for i, (pad, value) in enumerate(zip(contacts.finger, least, strict=True)):
+        if value <= AT_LIMIT and float(contacts.friction[i]) > 0:
+            left = float(as_states(forces.margin, 1)[:, i].min())
             message = (
                 f"pad '{pad}' is at its friction limit ({left:.2f} N to spare) and may slip; "
                 "grip harder or turn less"

@@ -215,24 +215,22 @@ class Evidence:
         for grasp, usable in zip(self.grasps, self.usable, strict=True):
             state, last = play.unknown(), None
             for k, rest in enumerate(grasp):
-                lin = self._linearize(rest) if usable[k] else None
-                dx = torch.zeros(0)
+                dx, motion = torch.zeros(0), None
                 if k:
                     dx, state = play.advance(state, rest.a - grasp[k - 1].a)
-                parts, motion = {}, None
-                if lin is not None:
-                    parts = self._equilibrium(lin, rest)
-                    if self.with_offset:
-                        parts |= self._encoders(lin, rest, state.position, figures)
-                    if last is not None:
-                        measured = rest.state.minus(grasp[k - 1].state)
-                        motion = measured - 0.5 * (last.step(dx) + lin.step(dx))
-                        moving = motion[: self.model.hand.n_q][self.model.moving(lin.contacts)]
-                        do, dphi = motion[-6:].split(3)
-                        parts |= _scaled(joints=moving, position=do, rotation=dphi)
-                if parts:
-                    yield parts, motion
-                last = lin
+                before, last = last, self._linearize(rest) if usable[k] else None
+                if last is None:
+                    continue
+                parts = self._equilibrium(last, rest)
+                if self.with_offset:
+                    parts |= self._encoders(last, rest, state.position, figures)
+                if before is not None:
+                    measured = rest.state.minus(grasp[k - 1].state)
+                    motion = measured - 0.5 * (before.step(dx) + last.step(dx))
+                    moving = motion[: self.model.hand.n_q][self.model.moving(last.contacts)]
+                    do, dphi = motion[-6:].split(3)
+                    parts |= _scaled(joints=moving, position=do, rotation=dphi)
+                yield parts, motion
 
     def _equilibrium(self, lin: Linearization, rest: Rest) -> dict[str, Tensor]:
         parts = [lin.forces.residual[self.model.moving(lin.contacts)] / self.model.options.forces.torque_std]
