@@ -37,6 +37,16 @@ def is_plain(*values: Tensor) -> bool:
     return True
 
 
+def zeros(like: AnyArray, *shape: int) -> Any:
+    """Zeros of the kind of ``like``."""
+    return like.new_zeros(shape) if isinstance(like, Tensor) else np.zeros(shape)
+
+
+def eye(like: AnyArray, n: int) -> Any:
+    """The unit matrix of the kind of ``like``."""
+    return torch.eye(n, dtype=like.dtype, device=like.device) if isinstance(like, Tensor) else np.eye(n)
+
+
 def norm(x: AnyArray) -> Any:
     """``|x|`` along the last axis."""
     return torch.linalg.vector_norm(x, dim=-1) if isinstance(x, Tensor) else np.sqrt((x * x).sum(-1))

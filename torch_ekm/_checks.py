@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from .exceptions import NonFiniteError, ParameterError, ShapeError
 from .typing import Tensor
@@ -78,6 +78,12 @@ def check_shape(name: str, value: Tensor, shape: Sequence[int], hint: str = "") 
     check_kind(name, value, Tensor, "a tensor: torch.as_tensor(...)")
     if tuple(value.shape) != tuple(shape):
         raise ShapeError(name, str(tuple(shape)), value.shape, hint)
+
+
+def check_last(name: str, value: Any, n: int, hint: str = "") -> None:
+    """ShapeError, with the hint, unless ``value`` is ``(*batch, n)``."""
+    if tuple(value.shape[-1:]) != (n,):
+        raise ShapeError(name, f"(*batch, {n})", value.shape, hint)
 
 
 def check_finite(name: str, value: Tensor) -> None:

@@ -14,8 +14,8 @@ from torch_ekm.description import ContactPad, load_hand, write_transmission
 from torch_ekm.exceptions import DescriptionError, ParameterError, StateError, UnknownNameError
 from torch_ekm.kinematics import Play
 from torch_ekm.model import KinematicModel, calibrate
+from torch_ekm.model.calibration.calibrate import Evidence, rests
 from torch_ekm.model.calibration.parameters import PRIORS, Unknowns
-from torch_ekm.model.calibration.residuals import Evidence, rests
 
 F64 = torch.float64
 
@@ -121,11 +121,11 @@ def test_the_derivative_of_the_residuals(toy, kind, monkeypatch):
     unknowns = Unknowns(hand, [kind])
     evidence = Evidence(toy.model(hand), rests(toy.recordings(steps=3)), unknowns)
     x = np.full(len(unknowns), 0.02)
-    slope = evidence(x).jacobian
+    slope = evidence.at(x).jacobian
     for k in range(len(x)):
         step = np.zeros(len(x))
         step[k] = 1e-4
-        ends = [evidence(x + sign * step, jacobian=False).value for sign in (1, -1)]
+        ends = [evidence.at(x + sign * step).value for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / 2e-4
         assert np.abs(slope[:, k] - expected).max() < 1e-3 * np.abs(expected).max() + 1e-6, (
             unknowns.parameters[k]

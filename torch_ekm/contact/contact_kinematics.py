@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import cached_property
 
-from .._arrays import like, namespace
+from .._arrays import eye, like, namespace, zeros
 from ..kinematics.se3 import cross, hat
 from ..typing import AnyArray, Bool, Float
 from .contact_set import ContactSet
@@ -106,10 +106,9 @@ class ContactKinematics:
     def relative_spin(self) -> Float[AnyArray, "*batch n_c 3 n_s"]:
         """Omega_i ds = w_finger - w_object: ``[J_w,i, 0, -I]``."""
         J_w = self.spin_jacobian
-        xp, kind = namespace(J_w), {"dtype": J_w.dtype, "device": J_w.device}
-        tail = xp.zeros((*J_w.shape[:-1], 6), **kind)
-        tail[..., 3:] = -xp.eye(3, **kind)
-        return xp.concat([J_w, tail], -1)
+        tail = zeros(J_w, *J_w.shape[:-1], 6)
+        tail[..., 3:] = -eye(J_w, 3)
+        return namespace(J_w).concat([J_w, tail], -1)
 
 
 def contact_frames(
@@ -127,10 +126,10 @@ def contact_frames(
         t1 = t1 / xp.sqrt((t1 * t1).sum(-1))[..., None].clip(1e-12)
         return xp.stack([n_in, t1, cross(n_in, t1)], -1)
     # a reflection takes -+e_z to n_in, and e_x and e_y to the tangents
-    eye = xp.eye(3, dtype=n_in.dtype, device=n_in.device)
+    axes = eye(n_in, 3)
     sign = xp.copysign(xp.ones_like(n_in[..., 2:]), n_in[..., 2:])
     across = n_in[..., :2] / (1 + sign * n_in[..., 2:])
-    tangent = eye[:, :2] - (n_in + sign * eye[2])[..., None] * across[..., None, :]
+    tangent = axes[:, :2] - (n_in + sign * axes[2])[..., None] * across[..., None, :]
     return xp.concat([n_in[..., None], tangent[..., :1], sign[..., None] * tangent[..., 1:]], -1)
 
 
@@ -141,8 +140,7 @@ def rolling_mobility(contacts: ContactSet) -> Float[AnyArray, "*batch n_c 3 3"]:
     ``K / tr(K)^2`` for rank one (a cylinder on a plane), 0 for rank nought.
     """
     n, xp = contacts.normal, namespace(contacts.normal)
-    kind = {"dtype": n.dtype, "device": n.device}
-    P = xp.eye(3, **kind) - n[..., None] * n[..., None, :]
+    P = eye(n, 3) - n[..., None] * n[..., None, :]
     K = P @ (contacts.finger_curvature + contacts.object_curvature) @ P
     trace = (K[..., 0, 0] + K[..., 1, 1] + K[..., 2, 2])[..., None, None]
     square = (K * K).sum((-2, -1))[..., None, None]
@@ -153,7 +151,8 @@ def rolling_mobility(contacts: ContactSet) -> Float[AnyArray, "*batch n_c 3 3"]:
     inverse = (trace * P - K) / xp.where(full, det, 1.0)
     m = xp.where(full, inverse, K / xp.where(trace > FLAT, trace, xp.inf) ** 2)
     if any(contacts.pinned):
-        m = m * xp.asarray([float(not p) for p in contacts.pinned], **kind)[:, None, None]
+        rolls = xp.asarray([not p for p in contacts.pinned], dtype=n.dtype, device=n.device)
+        m = m * rolls[:, None, None]
     return m
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .._checks import check_finite
+from .._checks import check_finite, check_shape
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import DescriptionError, ParameterError, ShapeError
@@ -22,12 +22,14 @@ from ..kinematics import HandKinematics, LinkPoses
 from ..kinematics.hand_kinematics import Kinematics
 from ..typing import Array, Float, Tensor
 from .contact_set import LINK_MARGIN, ContactSet, NearMiss
-from .pad_contact import LinkShapes, Pad, PadContact, Solid, pad_contact
+from .pad_contact import LinkShapes, PadContact, Solid, pad_contact, pad_shape
 
 CROWN_RADIUS = 0.5
 """R, of a pad along its axis [m]."""
 PRESSING = 0.006
 """Gap up to which a pad touches that measures a force [m]."""
+Touch = tuple[str, str, float, PadContact]
+"""Pad (or link without one), link, coefficient of torsional friction, contact."""
 
 
 class ContactDetector:
@@ -76,7 +78,7 @@ class ContactDetector:
         self.kinematics = HandKinematics(hand) if kinematics is None else kinematics
         self._coal = require("coal")
         self._links = [hand.link_names.index(pad.link) for pad in hand.pads]
-        self._pads = [Pad(self._coal, pad) for pad in hand.pads]
+        self._pads = [Solid(self._coal, pad_shape(pad)) for pad in hand.pads]
         self._shapes = [Solid(self._coal, shape) for shape in obj.shapes]
         self._other_links = LinkShapes(self._coal, hand, LINK_MARGIN, self._coarse_distance)
         self._request = self._coal.DistanceRequest()
@@ -105,7 +107,7 @@ class ContactDetector:
         frames, solids = self._placed(q, position, rotation)
         found, missed = self._of_pads(frames, solids, self.margin, pressing, measured=True)
         missed += self._other_links.touching(frames, solids)
-        return self._contact_set(found, missed, position.dtype, position.device)
+        return self._contact_set(found, missed, position)
 
     def near(
         self,
@@ -126,7 +128,8 @@ class ContactDetector:
         frames, solids = self._placed(q, position, rotation)
         found, _ = self._of_pads(frames, solids, margin, pressing, measured=False)
         links = self._other_links.contacts(frames, solids, margin, CROWN_RADIUS)
-        return self._contact_set(found, [], position.dtype, position.device, links)
+        found += [(name, name, self.obj.torsional_friction, contact) for name, contact in links]
+        return self._contact_set(found, [], position)
 
     def grown(self, distance: float) -> ContactDetector:
         """The same of an object whose surface is farther out by ``distance`` [m]."""
@@ -163,24 +166,26 @@ class ContactDetector:
         pressing: Collection[str],
         *,
         measured: bool,
-    ) -> tuple[list[tuple[int, PadContact]], list[NearMiss]]:
-        """Pads within the margin, by their place in the hand, and the others; gaps only if ``measured``."""
+    ) -> tuple[list[Touch], list[NearMiss]]:
+        """Pads within the margin, and the others; gaps only if ``measured``."""
         found, missed = [], []
-        for k, (pad, link) in enumerate(zip(self._pads, self._links, strict=True)):
-            most = max(margin, PRESSING) if self.hand.pads[k].name in pressing else margin
-            contact = self._nearest(pad, frames[link], solids, most, measured)
+        for pad, solid, link in zip(self.hand.pads, self._pads, self._links, strict=True):
+            most = max(margin, PRESSING) if pad.name in pressing else margin
+            contact = self._nearest(solid, frames[link], solids, most, measured)
             if isinstance(contact, PadContact):
-                found.append((k, contact))
+                # the softer of the two surfaces makes the patch that resists spinning
+                torsional = max(pad.torsional_friction, self.obj.torsional_friction)
+                found.append((pad.name, pad.link, torsional, contact))
             else:
-                missed.append(NearMiss(self.hand.pads[k].link, self.hand.pads[k].name, contact))
+                missed.append(NearMiss(pad.link, pad.name, contact))
         return found, missed
 
     def _nearest(
-        self, pad: Pad, T_link: Array, solids: list[tuple[Solid, Array]], margin: float, measured: bool
+        self, pad: Solid, T_link: Array, solids: list[tuple[Solid, Array]], margin: float, measured: bool
     ) -> PadContact | float:
         """The contact with the smallest gap over the object's primitives (the first one of equals), or else
         that gap."""
-        T_pad = T_link @ pad.transform
+        T_pad = T_link @ pad.shape.transform
         best: PadContact | None = None
         least = math.inf
         for solid, T_solid in solids:
@@ -194,42 +199,31 @@ class ContactDetector:
                 best = contact
         return least if best is None else best
 
-    def _coarse_distance(self, pad: Pad | Solid, T_pad: Array, solid: Solid, T_solid: Array) -> float:
+    def _coarse_distance(self, pad: Solid, T_pad: Array, solid: Solid, T_solid: Array) -> float:
         """coal's signed distance [m]: the gap without the crown, to its tolerance of 1e-6."""
         here, there = (self._coal.Transform3s(T[:3, :3], T[:3, 3]) for T in (T_pad, T_solid))
         self._result.clear()
         shapes = pad.geometry, here, solid.geometry, there
         return self._coal.distance(*shapes, self._request, self._result)
 
-    def _contact_set(
-        self,
-        found: list[tuple[int, PadContact]],
-        missed: list[NearMiss],
-        dtype: torch.dtype,
-        device: torch.device,
-        links: list[tuple[str, PadContact]] | None = None,
-    ) -> ContactSet:
-        pads, links = [self.hand.pads[k] for k, _ in found], links or []
-        contacts = [contact for _, contact in (*found, *links)]
-        # the softer of the two surfaces makes the patch that resists spinning
-        torsional = [max(pad.torsional_friction, self.obj.torsional_friction) for pad in pads]
-        torsional += [self.obj.torsional_friction] * len(links)
-        names = [name for name, _ in links]
+    def _contact_set(self, found: list[Touch], missed: list[NearMiss], position: Tensor) -> ContactSet:
+        """In the precision of ``position``."""
+        contacts = [contact for *_, contact in found]
 
         def tensor(values: list, *shape: int) -> Tensor:
-            array = np.array(values, dtype=np.float64).reshape(len(contacts), *shape)
-            return torch.from_numpy(array).to(device, dtype)
+            array = np.array(values, dtype=np.float64).reshape(len(found), *shape)
+            return torch.from_numpy(array).to(position)
 
         return ContactSet(
-            finger=(*(pad.name for pad in pads), *names),
-            link=(*(pad.link for pad in pads), *names),
+            finger=tuple(finger for finger, *_ in found),
+            link=tuple(link for _, link, *_ in found),
             point=tensor([c.point for c in contacts], 3),
             normal=tensor([c.normal for c in contacts], 3),
             gap=tensor([c.gap for c in contacts]),
             finger_curvature=tensor([c.finger_curvature for c in contacts], 3, 3),
             object_curvature=tensor([c.object_curvature for c in contacts], 3, 3),
-            friction=tensor([self.obj.friction for _ in contacts]),
-            torsional_friction=tensor(torsional),
+            friction=tensor([self.obj.friction] * len(found)),
+            torsional_friction=tensor([gamma for *_, gamma, _ in found]),
             pinned=tuple(c.pinned for c in contacts),
             near_misses=tuple(missed),
         )
@@ -243,6 +237,5 @@ class ContactDetector:
 
 
 def _check(name: str, value: Tensor, shape: tuple[int, ...]) -> None:
-    if tuple(value.shape) != shape:
-        raise ShapeError(name, str(shape), value.shape, "one posture and one pose at a time")
+    check_shape(name, value, shape, "one posture and one pose at a time")
     check_finite(name, value)

@@ -42,9 +42,8 @@ def analyse(kin: ContactKinematics, actuation: Float[Tensor, "n_a n_q"]) -> Gras
     scale[n_q : n_q + 3] = L
     row = torch.tensor([1 / L if r % 6 < 3 else 1.0 for r in kin.rows], dtype=A.dtype, device=A.device)
     A_s = row[:, None] * A * scale
-    if {*kin.models} == {
-        ContactModel.PLANAR_POINT_WITH_FRICTION
-    }:  # the plane's normal is each contact's second tangent
+    # the plane's normal is each contact's second tangent
+    if {*kin.models} == {ContactModel.PLANAR_POINT_WITH_FRICTION}:
         n, t, normal = kin.frame[0].unbind(-1)
         plane = A.new_zeros(6, 3)
         plane[:3, 0], plane[:3, 1], plane[3:, 2] = n, t, normal

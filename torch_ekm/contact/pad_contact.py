@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from math import sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,60 +16,45 @@ from .signed_distance import Vec, point_distance, surface_curvature, tangents
 _EYE = np.eye(3)
 
 
-class Pad:
-    """A capsule with its axis along z of ``transform`` (link frame), ``half`` its half length."""
-
-    def __init__(self, coal, pad: ContactPad) -> None:
-        start, end = np.array(pad.start), np.array(pad.end)
-        self.radius = pad.radius
-        self.half = float(np.linalg.norm(end - start)) / 2
-        self.transform = np.eye(4)
-        self.transform[:3, 3] = (start + end) / 2
-        if self.half > 0:
-            axis = (end - start) / (2 * self.half)
-            self.transform[:3, :3] = np.stack([*tangents(tuple(axis.tolist())), axis], axis=-1)
-            self.geometry = coal.Capsule(self.radius, 2 * self.half)
-        else:
-            self.geometry = coal.Sphere(self.radius)
-
-
-class LinkCapsule:
-    """The same of a link's own capsule or ball."""
-
-    def __init__(self, solid: Solid) -> None:
-        shape = solid.shape
-        self.geometry, self.transform = solid.geometry, np.array(shape.transform)
-        self.radius = shape.size[0]
-        self.half = shape.size[1] / 2 if shape.kind == "capsule" else 0.0
-
-
 class Solid:
-    """A primitive of the object, for coal and for the closed form."""
+    """A primitive of a link or an object, for coal and for the closed form."""
 
-    def __init__(self, coal, shape: Shape) -> None:
+    def __init__(self, coal: Any, shape: Shape) -> None:
         make = {"box": coal.Box, "cylinder": coal.Cylinder, "sphere": coal.Sphere, "capsule": coal.Capsule}
         self.shape = shape
         self.geometry = make[shape.kind](*shape.size)
         self.distance = point_distance(shape)
+        self.round = shape.kind in ("capsule", "sphere")
+        self.radius, self.half = shape.size[0], shape.size[1] / 2 if shape.kind == "capsule" else 0.0
 
 
-class PadContact:
-    """One contact of a pad: point, normal, gap [m] and curvatures [1/m], hand frame."""
+def pad_shape(pad: ContactPad) -> Shape:
+    """A pad in its link's frame, its axis along z."""
+    start, end = np.array(pad.start), np.array(pad.end)
+    length, transform = float(np.linalg.norm(end - start)), np.eye(4)
+    transform[:3, 3] = (start + end) / 2
+    if length == 0:
+        return Shape("sphere", (pad.radius,), transform)
+    axis = (end - start) / length
+    transform[:3, :3] = np.stack([*tangents(tuple(axis.tolist())), axis], axis=-1)
+    return Shape("capsule", (pad.radius, length), transform)
 
-    __slots__ = ("finger_curvature", "gap", "normal", "object_curvature", "pinned", "point")
 
-    def __init__(self, point: Array, normal: Array, gap: float, K_f: Array, K_o: Array, pinned: bool) -> None:
-        self.point, self.normal, self.gap = point, normal, gap
-        self.finger_curvature, self.object_curvature, self.pinned = K_f, K_o, pinned
+class PadContact(NamedTuple):
+    """One contact of a pad, hand frame."""
+
+    point: Array
+    normal: Array
+    gap: float
+    finger_curvature: Array
+    object_curvature: Array
+    pinned: bool
 
 
 def flat_contact(coal, link: Solid, T_link: Array, solid: Solid, T_solid: Array) -> PadContact:
     """The contact of a link's box or cylinder with one primitive, by coal's nearest points.
 
     The link counts as flat there; where the object is flat, too, nothing rolls.
-
-    Args:
-        T_link, T_solid: poses of the two primitives in the hand frame, ``(4, 4)``.
     """
     result = coal.DistanceResult()
     here, there = (coal.Transform3s(T[:3, :3], T[:3, 3]) for T in (T_link, T_solid))
@@ -93,7 +79,7 @@ def _curvature(principal: list, rotation: Array) -> Array:
 
 
 def pad_contact(
-    pad: Pad | LinkCapsule, T_pad: Array, solid: Solid, T_solid: Array, R: float, margin: float
+    pad: Solid, T_pad: Array, solid: Solid, T_solid: Array, R: float, margin: float
 ) -> PadContact | None:
     """The contact of a pad with one primitive; the equations are those of ``ContactDetector``.
 
@@ -200,9 +186,7 @@ class LinkShapes:
     distance to the object; only what is near is given to coal.
 
     Args:
-        coal: the module.
-        hand: its links.
-        margin: largest gap that is reported [m].
+        margin: largest gap at which a link touches [m].
         distance: signed distance of two solids at two poses [m].
     """
 
@@ -217,10 +201,6 @@ class LinkShapes:
         ]
         for _, _, solid in self._shapes:
             solid.geometry.computeLocalAABB()
-        self._round = [
-            LinkCapsule(solid) if solid.shape.kind in ("capsule", "sphere") else None
-            for _, _, solid in self._shapes
-        ]
         self._links = [index for index, *_ in self._shapes]
         self._centres = np.array([[*solid.shape.transform[:3, 3], 1.0] for _, _, solid in self._shapes])
 
@@ -232,9 +212,8 @@ class LinkShapes:
             solids: the object's primitives with their poses.
         """
         found: dict[str, float] = {}
-        for place, solid, T in self._near(frames, solids, self.margin):
-            index, link, shape = self._shapes[place]
-            gap = self._distance(shape, frames[index] @ shape.shape.transform, solid, T)
+        for link, shape, T_link, solid, T in self._near(frames, solids, self.margin):
+            gap = self._distance(shape, T_link, solid, T)
             if gap <= min(self.margin, found.get(link, self.margin)):
                 found[link] = gap
         return [NearMiss(link, None, gap) for link, gap in found.items()]
@@ -245,30 +224,25 @@ class LinkShapes:
         """Links within ``margin`` [m] of the object, each with the contact of its smallest gap, in the order
         of the hand's links; arguments as of :meth:`touching` and :func:`pad_contact`."""
         found: dict[str, PadContact] = {}
-        for place, solid, T in self._near(frames, solids, margin):
-            index, link, shape = self._shapes[place]
-            capsule, T_link = self._round[place], frames[index] @ shape.shape.transform
-            if capsule is not None:
-                one = pad_contact(capsule, T_link, solid, T, crown_radius, margin)
+        for link, shape, T_link, solid, T in self._near(frames, solids, margin):
+            if shape.round:
+                one = pad_contact(shape, T_link, solid, T, crown_radius, margin)
             else:
                 one = flat_contact(self._coal, shape, T_link, solid, T)
             if one is not None and one.gap <= margin and (link not in found or one.gap < found[link].gap):
                 found[link] = one
-        return [
-            (link, found[link])
-            for link in dict.fromkeys(name for _, name, _ in self._shapes)
-            if link in found
-        ]
+        names = dict.fromkeys(name for _, name, _ in self._shapes)
+        return [(link, found[link]) for link in names if link in found]
 
     def _near(
         self, frames: Array, solids: list[tuple[Solid, Array]], margin: float
-    ) -> Iterator[tuple[int, Solid, Array]]:
-        """Shapes whose balls are within ``margin`` of a primitive of the object."""
+    ) -> Iterator[tuple[str, Solid, Array, Solid, Array]]:
+        """Shapes whose balls are within ``margin`` of a primitive of the object, both with their poses."""
         if not self._shapes:
             return
         centres = (frames[self._links] @ self._centres[:, :, None])[:, :3, 0]
         for solid, T in solids:
             near = (centres - T[:3, 3]) @ T[:3, :3]
-            for place, centre in enumerate(near.tolist()):
-                if solid.distance(*centre)[0] <= self._shapes[place][2].geometry.aabb_radius + margin:
-                    yield place, solid, T
+            for (index, link, shape), centre in zip(self._shapes, near.tolist(), strict=True):
+                if solid.distance(*centre)[0] <= shape.geometry.aabb_radius + margin:
+                    yield link, shape, frames[index] @ shape.shape.transform, solid, T

@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from .._checks import check_last
 from ..description import HandDescription
-from ..exceptions import EquilibriumError, ShapeError
+from ..exceptions import EquilibriumError
 from ..typing import Array, Float, Tensor
 
 _NEWTON = 60  # steps before the way of the motors is divided
@@ -223,9 +224,7 @@ class ActuationMap(nn.Module):
             ShapeError: the last dimension is not ``n_a``; the message lists the actuators.
             EquilibriumError: none was found.
         """
-        at, found = self._rests(a)
-        q = np.array([rest.q for rest in found]).reshape(*at.shape[:-1], -1)
-        P = np.array([rest.projector for rest in found]).reshape(*q.shape, -1)
+        at, q, _, P = self._rests(a)
         return _along(a, at, q, P)
 
     def free_motion(self, a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_q n_a"]:
@@ -234,9 +233,7 @@ class ActuationMap(nn.Module):
         Raises:
             ShapeError, EquilibriumError: as :meth:`joints`.
         """
-        at, found = self._rests(a)
-        P = np.array([rest.projector for rest in found])
-        return torch.from_numpy(P.reshape(*at.shape[:-1], *P.shape[-2:])).to(self.J_a)
+        return torch.from_numpy(self._rests(a)[3]).to(self.J_a)
 
     def pull(self, a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_a"]:
         """Force of each actuator along +a in the hand that touches nothing [N m]; 0 of slack tendons.
@@ -244,18 +241,18 @@ class ActuationMap(nn.Module):
         Raises:
             ShapeError, EquilibriumError: as :meth:`joints`.
         """
-        at, found = self._rests(a)
-        return torch.from_numpy(np.array([rest.pull for rest in found]).reshape(at.shape)).to(self.J_a)
+        return torch.from_numpy(self._rests(a)[2]).to(self.J_a)
 
-    def _rests(self, a: Tensor) -> tuple[np.ndarray, list[Rest]]:
+    def _rests(self, a: Tensor) -> tuple[Array, Array, Array, Array]:
+        """a, and the parts of :class:`Rest` of each of the batch."""
         self._check("a", a, self.hand.actuator_names)
         at = a.detach().double().cpu().numpy()
-        return at, [self._free(one) for one in at.reshape(-1, at.shape[-1])]
+        rests = zip(*map(self._free, at.reshape(-1, at.shape[-1])), strict=True)
+        q, pull, P = (np.array(part).reshape(*at.shape[:-1], *part[0].shape) for part in rests)
+        return at, q, pull, P
 
     def _check(self, name: str, value: Tensor, names: tuple[str, ...]) -> None:
-        if value.dim() == 0 or value.shape[-1] != len(names):
-            hint = f"in order: {', '.join(names)}"
-            raise ShapeError(name, f"(*batch, {len(names)})", value.shape, hint)
+        check_last(name, value, len(names), f"in order: {', '.join(names)}")
 
     def extra_repr(self) -> str:
         return f"'{self.hand.name}', actuators={self.hand.n_a}, joints={self.hand.n_q}"

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from .._arrays import is_plain
-from .._checks import check_finite, check_kind
+from .._checks import check_finite, check_kind, check_last, check_shape
 from ..exceptions import ParameterError, ShapeError
 from ..typing import Float, Tensor
 from .se3 import cross, exp, log
@@ -45,11 +45,8 @@ class GraspState:
             object.__setattr__(self, name, value)  # the dataclass is frozen
         if self.q.dim() == 0:
             raise ShapeError("q", "(*batch, n_q)", self.q.shape)
-        batch = self.q.shape[:-1]
-        if self.position.shape != (*batch, 3):
-            raise ShapeError("position", f"{(*batch, 3)} to go with q", self.position.shape)
-        if self.rotation.shape != (*batch, 3, 3):
-            raise ShapeError("rotation", f"{(*batch, 3, 3)} to go with q", self.rotation.shape)
+        check_shape("position", self.position, (*self.q.shape[:-1], 3), "to go with q")
+        check_shape("rotation", self.rotation, (*self.q.shape[:-1], 3, 3), "to go with q")
         total = self.q.sum() + self.position.sum() + self.rotation.sum()  # an infinity or a NaN is in it
         if not math.isfinite(total):
             for name in given:
@@ -64,8 +61,7 @@ class GraspState:
     def plus(self, ds: Float[Tensor, "*batch n_s"]) -> GraspState:
         """Retraction: ``q + dq``, ``o + do``, ``exp([dphi]x) R``."""
         (ds,), n_q = as_tensors(ds=ds), self.q.shape[-1]
-        if ds.shape[-1:] != (n_q + 6,):
-            raise ShapeError("ds", f"(*batch, {n_q + 6})", ds.shape, "it is [dq; do; dphi]")
+        check_last("ds", ds, n_q + 6, "it is [dq; do; dphi]")
         dq, do, dphi = ds.split([n_q, 3, 3], dim=-1)
         return GraspState(self.q + dq, self.position + do, exp(dphi) @ self.rotation)
 

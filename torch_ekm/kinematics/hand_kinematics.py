@@ -9,10 +9,10 @@ import torch
 from torch import nn
 
 from .._arrays import is_plain
-from .._checks import check_kind
+from .._checks import check_kind, check_last
 from .._extras import require
 from ..description import HandDescription
-from ..exceptions import ParameterError, ShapeError, UnknownNameError
+from ..exceptions import ParameterError, UnknownNameError
 from ..typing import Array, Bool, Float, Tensor
 from .se3 import exp
 
@@ -31,9 +31,13 @@ class LinkPoses:
         Raises:
             UnknownNameError: there is no such link; the message lists all.
         """
-        if name not in self.link_names:
-            raise UnknownNameError("link", name, self.link_names)
-        return self.transforms[..., self.link_names.index(name), :, :]
+        return self.transforms[..., _place(name, self.link_names), :, :]
+
+
+def _place(name: str, names: tuple[str, ...]) -> int:
+    if name not in names:
+        raise UnknownNameError("link", name, names)
+    return names.index(name)
 
 
 @runtime_checkable
@@ -126,9 +130,7 @@ class HandKinematics(nn.Module):
         Raises:
             UnknownNameError: there is no such link; the message lists all.
         """
-        if name not in self.link_names:
-            raise UnknownNameError("link", name, self.link_names)
-        return self.link_names.index(name)
+        return _place(name, self.link_names)
 
     def forward(self, q: Float[Tensor, "*batch n_q"]) -> LinkPoses:
         """Poses of all links at joint angles ``q`` [rad]; a NaN angle gives NaN poses.
@@ -137,10 +139,8 @@ class HandKinematics(nn.Module):
             ShapeError: the last dimension is not ``n_q``; the message lists the joints in order.
             ParameterError: ``q`` has another dtype than this module.
         """
-        shape, n_q = check_kind("q", q, Tensor, "a tensor: torch.as_tensor(q)").shape, len(self.joint_names)
-        if not shape or shape[-1] != n_q:
-            joints = ", ".join(self.joint_names)
-            raise ShapeError("q", f"(*batch, {n_q})", shape, f"the joints are, in order: {joints}")
+        check_kind("q", q, Tensor, "a tensor: torch.as_tensor(q)")
+        check_last("q", q, len(self.joint_names), f"the joints are, in order: {', '.join(self.joint_names)}")
         if q.dtype != self._chain.dtype:
             valid = f"{self.dtype}, the dtype of this module (change it with .to())"
             raise ParameterError("q.dtype", q.dtype, valid)
@@ -226,8 +226,7 @@ class HandKinematics(nn.Module):
         T = poses.transforms[..., k, :, :]
         x = T[..., :3, 3]
         if point is not None:
-            if point.shape[-1:] != (3,):
-                raise ShapeError("point", "(*batch, 3)", point.shape, "it is a point in the link's frame")
+            check_last("point", point, 3, "it is a point in the link's frame")
             x = x + (T[..., :3, :3] @ point[..., None])[..., 0]
         axis, origin = self.joint_axes(poses)
         v = torch.linalg.cross(axis, x[..., None, :] - origin)

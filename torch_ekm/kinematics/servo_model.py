@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from torch import nn
 
 from .._arrays import like, namespace
-from .._checks import check_finite, check_shape
+from .._checks import check_finite, check_last, check_shape
 from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, covariance_problems
 from ..description import HandDescription
-from ..exceptions import ParameterError, ShapeError
+from ..exceptions import ParameterError
 from ..typing import AnyArray, Array, Bool, Float, Tensor
 
 
@@ -78,14 +78,9 @@ class Play:
         Raises:
             ShapeError: ``delta_a`` has not one entry per actuator.
         """
-        self._check(delta_a)
+        check_last("delta_a", delta_a, len(self.width), "one entry per actuator")
         after = PlayState(self.at(state.low - delta_a).low, self.at(state.high - delta_a).low)
         return delta_a + after.position - state.position, after
-
-    def _check(self, increment: AnyArray) -> None:
-        if increment.shape[-1:] != self.width.shape[-1:]:
-            expected = f"(*batch, {self.width.shape[-1]})"
-            raise ShapeError("delta_a", expected, increment.shape, "one entry per actuator")
 
 
 Mask = NDArray[np.bool_]

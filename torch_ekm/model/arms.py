@@ -56,10 +56,7 @@ def bends(
 ) -> Any:
     """``sum_i lam_i d2l_i/dq2 + sum_k nu_k d2c_k/dq2`` ``(*batch, n_q, n_q)``; 0 where no arm changes.
 
-    Args:
-        actuation: J_a of the description.
-        lam: minus the forces of the actuators.
-        loop: nu, forces of the loops.
+    ``actuation`` is J_a of the description, ``loop`` nu, the forces of the loops.
     """
     parts = [] if hand.lengths.constant else [(hand.lengths, lam, actuation)]
     if hand.loops is not None and loop.shape[-1]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .._arrays import like, namespace
+from .._arrays import like, namespace, zeros
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
 from ..contact.forces.problem import BalanceEquations, ForceSolution, ForceStatus, friction_cones, margins
@@ -96,21 +96,13 @@ class ForceBalance:
         """Forces in the equilibrium ``V_s + A^T mu + B^T lam = 0`` of every state.
 
         Args:
-            q: joint angles [rad].
-            kin: the contacts.
-            A: their constraint matrix.
             V_s: gradient of the potential energy [N m, N].
-            arms: moment arms and loops at these postures.
             normal: measured normal forces [N], NaN where there is no sensor.
             expected: prediction from the state before.
             last: forces of the step before, which stand in where the problem has no answer; None: zeros.
         """
-        given, options = (A, V_s), self.options.forces
-        batch, n_q = q.shape[:-1], q.shape[-1]
-        A, V_s = as_states(A, 2), as_states(V_s, 1)
-        Z_p, Z = self.pose_basis, self.joint_basis
-        object_matrix, hand_matrix = -Z_p.T @ A[:, :, n_q:].mT, Z.T @ A[:, :, :n_q].mT
-        object_load, hand_load = V_s[:, n_q:] @ Z_p, V_s[:, :n_q] @ Z
+        options, batch, n_q = self.options.forces, q.shape[:-1], q.shape[-1]
+        states = zip(as_states(q, 1), *self._reduced(as_states(A, 2), as_states(V_s, 1)), strict=True)
         measured = None if normal is None else as_states(normal, 1)
         estimating = measured is not None or expected is not None
         prior = ForcePrior(kin, expected, options) if estimating else None
@@ -123,21 +115,21 @@ class ForceBalance:
             closed = as_states(torch.as_tensor(arms.closed).detach().double().cpu().numpy(), 2)
         table: list[tuple] = []
         problems: list[tuple[BalanceEquations, ForceSolution]] = []
-        for k, q_k in enumerate(as_states(q, 1)):
+        for k, (q_k, G, object_load, hand_matrix, hand_load) in enumerate(states):
             joints, lower, upper = self._bounded(q_k)
             bounded = -self.joint_basis[joints].T
             if arms.ratio is not None:
                 actuation = self._arms(arms.one(k))
             if closed is not None:  # a loop is a rod whose force nothing bounds
-                bounded = np.concatenate([bounded, Z.T @ closed[k].T], axis=1)
+                bounded = np.concatenate([bounded, self.joint_basis.T @ closed[k].T], axis=1)
                 free = np.full(len(closed[k]), np.inf)
                 lower, upper = np.append(lower, -free), np.append(upper, free)
             eq = BalanceEquations(
-                object_matrix=object_matrix[k],
-                object_load=object_load[k],
-                hand_matrix=hand_matrix[k],
+                object_matrix=G,
+                object_load=object_load,
+                hand_matrix=hand_matrix,
                 actuator_matrix=actuation,
-                hand_load=hand_load[k],
+                hand_load=hand_load,
                 cones=cones,
                 moment_rows=self.moment_rows,
                 tendon=self.tendon,
@@ -171,9 +163,9 @@ class ForceBalance:
         if isinstance(q, Tensor):
             parts = {name: torch.from_numpy(value).to(q) for name, value in parts.items()}
         parts["violation"] = parts["violation"][..., 0]
-        inputs = (*given, self.reduction.actuation)
+        inputs = A, V_s, self.reduction.actuation
         if isinstance(q, Tensor) and torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
-            moving = self._with_graph(problems, arms, *given, *(parts[name] for name in names[:3]))
+            moving = self._with_graph(problems, arms, A, V_s, *(parts[name] for name in names[:3]))
             parts.update(zip(names, moving, strict=False))
         status = tuple(solution.status for _, solution in problems)
         forces = pack_forces(kin, **parts, status=status)
@@ -184,44 +176,42 @@ class ForceBalance:
         sure = torch.from_numpy(sure).to(q) if isinstance(q, Tensor) else sure
         return with_covariance(kin.contacts, forces, sure)
 
+    def _reduced(self, A: AnyArray, V_s: AnyArray) -> tuple[Any, Any, Any, Any]:
+        """``-(A_p Z_p)^T``, ``Z_p^T V_p``, ``(A_q Z)^T``, ``Z^T V_q``: both in permitted motions."""
+        Z_p, Z, n_q = self.pose_basis, self.joint_basis, len(self.joint_basis)
+        if isinstance(A, Tensor):
+            Z_p, Z = (torch.from_numpy(basis).to(A) for basis in (Z_p, Z))
+        return -Z_p.mT @ A[..., n_q:].mT, V_s[..., n_q:] @ Z_p, Z.mT @ A[..., :n_q].mT, V_s[..., :n_q] @ Z
+
     def _with_graph(
         self,
         problems: list[tuple[BalanceEquations, ForceSolution]],
         arms: Arms,
         A: Tensor,
         V_s: Tensor,
-        mu: Tensor,
-        lam: Tensor,
-        residual: Tensor,
-    ) -> tuple[Tensor, Tensor, Tensor]:
+        *found: Tensor,
+    ) -> tuple[Tensor, ...]:
         """``mu``, ``lam`` and e with their derivative; those of an unsolved problem are constants."""
-        n_q, batch = V_s.shape[-1] - 6, mu.dim() - 1
-        V_q, V_p = V_s[..., :n_q], V_s[..., n_q:]
-        Z, Z_p, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.pose_basis, self.lift))
-        at = [arms.one(k) for k in range(len(problems))]
-        G, load, hand, V_z = -Z_p.mT @ A[..., n_q:].mT, V_p @ Z_p, Z.mT @ A[..., :n_q].mT, V_q @ Z
-        results = []
+        Z, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.lift))
+        batch = V_s.dim() - 1
+        parts = [x.reshape(-1, *x.shape[batch:]) for x in (*found, *self._reduced(A, V_s))]
+        rows = []
         for k, (eq, solution) in enumerate(problems):
-            own = [x.reshape(-1, *x.shape[batch:])[k] for x in (mu, lam, residual, G, load, hand, V_z)]
-            forces = tuple(own[:3])
+            mu, lam, e, *given = (part[k] for part in parts)
             if solution.status is ForceStatus.SOLVED:
-                closed = at[k].closed
-                *forces, e = differentiable_forces(
+                at = arms.one(k)
+                mu, lam, e = differentiable_forces(
                     eq,
                     self.options.forces,
                     solution,
-                    *own[3:6],
-                    actuator_matrix=(at[k].of(self.reduction.actuation) @ Z).mT,
-                    hand_load=own[6],
-                    closed=None if closed is None else (closed @ Z).mT,
+                    *given,
+                    actuator_matrix=(at.of(self.reduction.actuation) @ Z).mT,
+                    closed=None if at.closed is None else (at.closed @ Z).mT,
                 )
-                forces = (*forces, lift @ e)
-            results.append(forces)
-        stacked = (torch.stack(part) for part in zip(*results, strict=True))
-        first, second, third = (
-            x.reshape(old.shape) for x, old in zip(stacked, (mu, lam, residual), strict=True)
-        )
-        return first, second, third
+                e = lift @ e
+            rows.append((mu, lam, e))
+        stacked = zip(zip(*rows, strict=True), found, strict=True)
+        return tuple(torch.stack(part).reshape(old.shape) for part, old in stacked)
 
     def _bounded(self, q: np.ndarray) -> tuple[list[int], np.ndarray, np.ndarray]:
         """Joints with a torque of their own, and its bounds: stops push inwards."""
@@ -234,7 +224,7 @@ class ForceBalance:
 def pack_forces(kin: ContactKinematics, mu: AnyArray, lam: AnyArray, **rest) -> GraspForces:
     """Forces in hand axes from components in contact frames."""
     n_c, batch = kin.contacts.n_c, mu.shape[:-1]
-    full = namespace(mu).zeros((*batch, 6 * n_c), dtype=mu.dtype, device=mu.device)
+    full = zeros(mu, *batch, 6 * n_c)
     full[..., kin.row_index] = mu
     full = full.reshape(*batch, n_c, 6)
     force = (kin.frame @ full[..., :3, None])[..., 0]

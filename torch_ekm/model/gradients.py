@@ -10,6 +10,7 @@ the bracket is 0, so the value is ``x*``, and its derivative is ``-(dr/dx)^-1 dr
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -53,27 +54,18 @@ def following(
     small step changes who touches, that direction has no derivative and counts as 0.
     """
     here = GraspState(state.q.detach(), state.position.detach(), state.rotation.detach())
-    n_q = here.q.shape[-1]
-    asked = [j for j in range(here.n_s) if (state.q if j < n_q else state.position).requires_grad]
-    if state.rotation.requires_grad and not state.position.requires_grad:
-        asked += list(range(n_q + 3, here.n_s))
-    if not asked:
+    parts = (state.q, here.n_s - 6), (state.position, 3), (state.rotation, 3)
+    asked = [part.requires_grad for part, size in parts for _ in range(size)]
+    if not any(asked):
         return contacts
     columns: dict[str, list[Tensor]] = {name: [] for name in VARYING}
-    for j in asked:
-        ds = here.q.new_zeros(here.n_s)
-        ds[j] = _STEP
-        ends = []
-        for sign in (1.0, -1.0):
-            try:
-                ends.append(detect(here.plus(sign * ds)))
-            except NoContactError:
-                ends.append(contacts.replace(finger=()) if contacts.n_c == 0 else None)
-        same = all(end is not None and end.finger == contacts.finger for end in ends)
+    for ds in _STEP * torch.eye(here.n_s, dtype=here.q.dtype)[asked]:
+        ends = [contacts, contacts]
+        with contextlib.suppress(NoContactError):
+            moved = [detect(here.plus(way)) for way in (ds, -ds)]
+            ends = moved if all(end.finger == contacts.finger for end in moved) else ends
         for name in VARYING:
-            zero = torch.zeros_like(getattr(contacts, name))
-            change = (getattr(ends[0], name) - getattr(ends[1], name)) / (2 * _STEP) if same else zero
-            columns[name].append(change)
+            columns[name].append((getattr(ends[0], name) - getattr(ends[1], name)) / (2 * _STEP))
     ds = state.minus(here)[asked]  # 0, with the derivative of the state
     return contacts.replace(
         **{name: getattr(contacts, name) + torch.stack(columns[name], dim=-1) @ ds for name in VARYING}
@@ -87,9 +79,9 @@ def differentiable_forces(
     object_matrix: Tensor,
     object_load: Tensor,
     hand_matrix: Tensor,
-    actuator_matrix: Tensor,
     hand_load: Tensor,
-    closed: Tensor | None = None,
+    actuator_matrix: Tensor,
+    closed: Tensor | None,
 ) -> tuple[Float[Tensor, " n_h"], Float[Tensor, " n_a"], Float[Tensor, " n_z"]]:
     """``mu``, ``lam`` and the joint residual of a solved problem, with their derivative at its active set.
 
@@ -100,7 +92,7 @@ def differentiable_forces(
 
     Args:
         eq, options, solution: the problem and its answer.
-        object_matrix, object_load, hand_matrix, actuator_matrix, hand_load: as in ``eq``, with a graph.
+        object_matrix, object_load, hand_matrix, hand_load, actuator_matrix: as in ``eq``, with a graph.
         closed: the last columns of its bound matrix, of loops, likewise.
     """
     cost = force_cost(eq, options)

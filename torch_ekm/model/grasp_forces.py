@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from .._arrays import namespace, norm
+from .._arrays import eye, namespace, norm, zeros
 from .._noise import NOISE
 from ..contact.contact_kinematics import ContactKinematics
 from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
@@ -118,14 +118,13 @@ def start_covariance(
     normal: Float[AnyArray, "*batch n_c 3"], options: ForceOptions
 ) -> Float[Any, "*batch m m"]:
     """``start_std^2`` across the normals, any force along them; ``(start_std L)^2`` for spin moments."""
-    xp, (*batch, n_c, _) = namespace(normal), normal.shape
-    kind = {"dtype": normal.dtype, "device": normal.device}
+    *batch, n_c, _ = normal.shape
     along = normal[..., None] * normal[..., None, :]
-    blocks = xp.zeros((*batch, n_c, 4, 4), **kind)
-    across = xp.eye(3, **kind) - along
+    blocks = zeros(normal, *batch, n_c, 4, 4)
+    across = eye(normal, 3) - along
     blocks[..., :3, :3] = options.start_std**2 * across + NOISE.any_normal_force**2 * along
     blocks[..., 3, 3] = (options.start_std * CHARACTERISTIC_LENGTH) ** 2
-    spread = blocks[..., :, :, None, :] * xp.eye(n_c, **kind)[:, None, :, None]
+    spread = blocks[..., :, :, None, :] * eye(normal, n_c)[:, None, :, None]
     return spread.reshape(*batch, 4 * n_c, 4 * n_c)
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import torch
 from torch import nn
 
-from .._arrays import in_numpy, is_plain, like, namespace
+from .._arrays import in_numpy, is_plain, like, namespace, zeros
 from .._checks import check_kind
 from .._noise import NOISE
 from ..contact.contact_kinematics import ContactKinematics, constraint_matrix, contact_kinematics
@@ -27,14 +27,8 @@ from .motion_equations import MotionEquations
 from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .options import ModelOptions
 from .reduction import Reduction, sensitivities
-from .stiffness import (
-    geometric_stiffness,
-    gravity_gradient,
-    gravity_hessian,
-    precedence,
-    spring_torque,
-)
-from .validity import at_pads, check_contacts, check_described, check_inertia, check_state, find_doubts
+from .stiffness import geometric_stiffness, gravity_gradient, gravity_hessian
+from .validity import at_pads, check_contacts, check_described, check_state, find_doubts
 
 TOUCHING = 0.2e-3
 """Gap of a link that counts as touching [m]."""
@@ -98,7 +92,6 @@ class KinematicModel(nn.Module):
     ) -> None:
         super().__init__()
         check_described(hand, obj)
-        check_inertia(obj)
         hand = hand.counted()
         self.hand, self.obj, self.options = hand, obj, options or ModelOptions()
         self.kinematics = HandKinematics(hand, dtype=dtype) if kinematics is None else kinematics
@@ -117,7 +110,9 @@ class KinematicModel(nn.Module):
         for name, value in figures.items():
             value = None if value is None else torch.as_tensor(value).to(dtype)
             self.register_buffer(name, value, persistent=False)
-        self.register_buffer("precedes", precedence(self.kinematics.upstream), persistent=False)
+        moved = self.kinematics.upstream.mT  # a proximal joint moves every link that the other one moves
+        precedes = (moved[:, None, :] | ~moved[None, :, :]).all(-1)
+        self.register_buffer("precedes", precedes, persistent=False)
 
     def with_figures(self, figures: FollowedFigures) -> KinematicModel:
         """A model of the same hand and object whose J_m follows ``figures`` as they are learned.
@@ -333,16 +328,15 @@ class KinematicModel(nn.Module):
         A = constraint_matrix(kin)
         V_s, V_ss = self.potential(at)
         arms = arms_at(self.hand, at.q)
-        last, measured, before = None, None, () if previous is None else previous.contacts.finger
+        last, before, measured = None, () if previous is None else previous.contacts.finger, {}
         if fingertip_force is not None:
             measured = at_pads(self.hand, contacts, fingertip_force, at.q)
         if forces is None:
             if previous is not None and previous.forces.solved and before == contacts.finger:
                 last = previous.forces
-            readings = None if measured is None else [measured[finger] for finger in contacts.finger]
-            touch = None if readings is None else namespace(at.q).stack(readings, -1)
-            known = {"normal": touch, "expected": expected, "last": last}
-            forces = self.balance(at.q, kin, A, V_s, arms=arms, **known)
+            touch = [measured[finger] for finger in contacts.finger] if measured else None
+            normal = None if touch is None else namespace(at.q).stack(touch, -1)
+            forces = self.balance(at.q, kin, A, V_s, arms=arms, normal=normal, expected=expected, last=last)
 
         o = self.options
         if on_unstable is not None and on_unstable != o.on_unstable:
@@ -392,16 +386,16 @@ class KinematicModel(nn.Module):
     ) -> tuple[Float[AnyArray, "*batch n_s"], Float[AnyArray, "*batch n_s n_s"]]:
         """``V_s`` [N m, N] and ``V_ss`` of springs and the object's weight."""
         n_q = self.hand.n_q
-        q, xp = state.q, namespace(state.q)
+        q = state.q
         buffers = self.com, self.spring_stiffness, self.spring_rest, self.weight
         com, springs, rest, weight = (like(buffer, q) for buffer in buffers)
         com_lever = (state.rotation @ com[:, None])[..., 0]
-        V_ss = xp.zeros((*q.shape[:-1], n_q + 6, n_q + 6), dtype=q.dtype, device=q.device)
-        V_ss[..., :n_q, :n_q] = xp.diag(springs)
+        V_ss = zeros(q, *q.shape[:-1], n_q + 6, n_q + 6)
+        V_ss[..., :n_q, :n_q] = namespace(q).diag(springs)
         V_ss[..., n_q:, n_q:] = gravity_hessian(weight, com_lever)
-        torque, over = spring_torque(q, springs, rest), self.hand.tendon_springs
+        torque, over = springs * (q - rest), self.hand.tendon_springs
         if over is not None:
             torque = torque + over_posture(q, over.torque)
             V_ss[..., :n_q, :n_q] += over_posture(q, over.stiffness_matrix)
         V_s = [torque, gravity_gradient(weight, com_lever)]
-        return xp.concat(V_s, -1), V_ss
+        return namespace(q).concat(V_s, -1), V_ss

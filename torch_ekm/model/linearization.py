@@ -9,10 +9,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from .._arrays import in_numpy, in_torch, is_plain, like, namespace, norm, of_fields
-from .._checks import check_finite
+from .._arrays import eye, in_numpy, in_torch, is_plain, like, norm, of_fields, zeros
+from .._checks import check_finite, check_last
 from ..contact.contact_set import ContactSet
-from ..exceptions import ShapeError
 from ..kinematics.grasp_state import GraspState
 from ..kinematics.tensors import as_tensors
 from ..typing import AnyArray, Bool, Float, Tensor
@@ -72,9 +71,8 @@ class Linearization:
     @cached_property
     def _arrays(self) -> Linearization:
         """The same in numpy, without derivatives."""
-        fields = vars(in_numpy(self))
-        fields |= {"forces": in_numpy(self.forces), "contacts": in_numpy(self.contacts)}
-        return of_fields(Linearization, **fields)
+        parts = {"forces": in_numpy(self.forces), "contacts": in_numpy(self.contacts)}
+        return of_fields(Linearization, **vars(in_numpy(self)) | parts)
 
     @property
     def n_q(self) -> int:
@@ -140,40 +138,30 @@ class Linearization:
         """What the contacts bear after an increment, as long as they stick: forces to first order.
 
         Raises:
-            ShapeError: ``delta_a`` does not have one entry per actuator.
-            NonFiniteError: an entry is NaN or infinite.
+            ShapeError, NonFiniteError: as of :meth:`step`.
         """
         da = self._increment(delta_a)
-        at = self._where(da)
-        return in_torch(at._after(like(da, at.manipulation_jacobian)))
-
-    def _where(self, da: Tensor) -> Linearization:
-        """This, or where it suffices its arrays."""
         one = da.dim() == 1 and self.manipulation_jacobian.dim() == 2
         plain = one and is_plain(da, self.manipulation_jacobian, self.forces.force)
-        return self._arrays if plain else self
+        at = self._arrays if plain else self
+        return in_torch(at._after(like(da, at.manipulation_jacobian)))
 
-    def _moved(self, da: AnyArray) -> tuple[Any, Any, Any, Any, Any]:
-        """Forces, spin moments and normals after an increment, and the changes of the first two."""
-        dmu, xp = _times(self.contact_force_sensitivity, da), namespace(da)
+    def _after(self, da: AnyArray) -> ExpectedForces:
+        dmu = _times(self.contact_force_sensitivity, da)
         ends = (*self.normal_rows[1:], dmu.shape[-1])
-        dspin = xp.zeros((*dmu.shape[:-1], self.contacts.n_c), dtype=dmu.dtype, device=dmu.device)
+        dspin = zeros(dmu, *dmu.shape[:-1], self.contacts.n_c)
         for i, (row, end) in enumerate(zip(self.normal_rows, ends, strict=True)):
             if end - row == 4:  # a soft finger
                 dspin[..., i] = dmu[..., row + 3]
         df = _times(self.force_vector_sensitivity, da[..., None, :])
         normal = self.contacts.normal + _times(self.normal_motion, da[..., None, :])
         normal = normal / norm(normal)[..., None]
-        return self.forces.force + df, self.forces.spin_moment + dspin, normal, df, dspin
-
-    def _after(self, da: AnyArray) -> ExpectedForces:
-        force, spin, normal, df, dspin = self._moved(da)
+        force, spin = self.forces.force + df, self.forces.spin_moment + dspin
         f_n, margin, gradient = friction_use(self.contacts, force, spin, normal)
         covariance = self.forces.covariance
         if covariance is None:
             covariance = start_covariance(self.contacts.normal, self.options.forces)
-        eye = namespace(da).eye(covariance.shape[-1], dtype=da.dtype, device=da.device)
-        covariance = covariance + drift(df, dspin)[..., None] * eye
+        covariance = covariance + drift(df, dspin)[..., None] * eye(da, covariance.shape[-1])
         return of_fields(
             ExpectedForces,
             finger=self.contacts.finger,
@@ -192,19 +180,13 @@ class Linearization:
         ``margins + margin_sensitivity da`` to first order, but exact in the cone.
 
         Raises:
-            ShapeError: ``delta_a`` does not have one entry per actuator.
-            NonFiniteError: an entry is NaN or infinite.
+            ShapeError, NonFiniteError: as of :meth:`step`.
         """
-        da = self._increment(delta_a)
-        at = self._where(da)
-        force, spin, normal, *_ = at._moved(like(da, at.manipulation_jacobian))
-        return torch.as_tensor(friction_use(at.contacts, force, spin, normal)[1])
+        return self.forces_after(delta_a).margin
 
     def _increment(self, delta_a: Tensor) -> Tensor:
         delta_a = as_tensors(delta_a=delta_a)[0].to(self.manipulation_jacobian)
-        n_a = self.manipulation_jacobian.shape[-1]
-        if delta_a.shape[-1:] != (n_a,):
-            raise ShapeError("delta_a", f"(*batch, {n_a})", delta_a.shape, "one entry per actuator")
+        check_last("delta_a", delta_a, self.manipulation_jacobian.shape[-1], "one entry per actuator")
         check_finite("delta_a", delta_a)
         return delta_a
 

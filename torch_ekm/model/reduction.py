@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from .._arrays import like, namespace, norm
+from .._arrays import eye, like, namespace, norm, zeros
 from ..contact.contact_kinematics import ContactKinematics, ContactModel
 from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..description.hand import HandDescription
@@ -55,7 +55,7 @@ def force_change(
 ) -> Float[AnyArray, "*batch n_c 3 n_a"]:
     """``C_i dmu_i``: change of the force vectors in hand axes."""
     n_c, (*batch, _, n_a) = kin.contacts.n_c, dmu.shape
-    full = namespace(dmu).zeros((*batch, 6 * n_c, n_a), dtype=dmu.dtype, device=dmu.device)
+    full = zeros(dmu, *batch, 6 * n_c, n_a)
     full[..., kin.row_index, :] = dmu
     return kin.frame @ full.reshape(*batch, n_c, 6, n_a)[..., :3, :]
 
@@ -169,19 +169,19 @@ class Reduction(nn.Module):
         """
         if held.ndim == 1:
             return self._solve(D, A, rows, held, slack, on_unstable, arms)
-        n_q = held.shape[-1]
+        n_q, batch = held.shape[-1], held.shape[:-1]
         pattern = torch.cat([held, slack], dim=-1).reshape(-1, n_q + slack.shape[-1])
         own = arms.varies  # each state then has its own
-        if not own and (len(pattern) == 1 or bool((pattern == pattern[0]).all())):
-            return self._solve(D, A, rows, pattern[0, :n_q], pattern[0, n_q:], on_unstable)
-        batch = held.shape[:-1]
+        groups = pattern if own else torch.unique(pattern, dim=0)
+        if not own and len(groups) == 1:
+            return self._solve(D, A, rows, groups[0, :n_q], groups[0, n_q:], on_unstable)
         flat_D, flat_A = D.reshape(-1, *D.shape[-2:]), A.reshape(-1, *A.shape[-2:])
         parts: list[Tensor] = []
-        for k, unique in enumerate(pattern if own else torch.unique(pattern, dim=0)):
-            at = torch.arange(len(pattern)) == k if own else (pattern == unique).all(-1)
+        for k, same in enumerate(groups):
+            at = torch.arange(len(pattern)) == k if own else (pattern == same).all(-1)
             there = arms.one(k) if own else arms
-            one = flat_D[at], flat_A[at], rows, unique[:n_q], unique[n_q:], on_unstable, there
-            group = [torch.as_tensor(part) for part in self._solve(*one)]
+            group = self._solve(flat_D[at], flat_A[at], rows, same[:n_q], same[n_q:], on_unstable, there)
+            group = [torch.as_tensor(part) for part in group]
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
@@ -205,28 +205,24 @@ class Reduction(nn.Module):
     ) -> ReducedStep:
         """The equations in permitted coordinates z, scaled, of states in which the same joints are held.
 
-        Args:
-            D, A, rows, held, slack: as in :meth:`solve`; held and slack of one state.
-            drives: in place of the description's.
-            arms: at the posture.
+        Arguments as of :meth:`solve`, held and slack of one state; ``drives`` in place of the description's.
         """
         J_a, K_a = (like(part, D) for part in self.drives) if drives is None else drives
         J_a = arms.of(J_a)
         n_a, n_q = J_a.shape
         n_h, L, S, xp = len(rows), CHARACTERISTIC_LENGTH, like(self.scaled_basis, D), namespace(D)
         D = _left(S, D @ S)
-        kind = {"dtype": D.dtype, "device": D.device}
-        row_scale = xp.asarray([1 / L if row % 6 < 3 else 1.0 for row in rows], **kind)
+        row_scale = [1 / L if row % 6 < 3 else 1.0 for row in rows]
+        row_scale = xp.asarray(row_scale, dtype=D.dtype, device=D.device)
         A = row_scale[:, None] * (A @ S)
         B = J_a @ S[:n_q]
         finite, taut = xp.isfinite(K_a), ~slack
         rigid, soft = (xp.where(which)[0] for which in (taut & ~finite, taut & finite))
-        eye = xp.eye(n_a, **kind)
-        F = None
+        unit, F = eye(D, n_a), None
         if len(soft):
             K_B = K_a[soft, None] * B[soft]
             D = D + B[soft].mT @ K_B
-            F = K_B.mT @ eye[soft]
+            F = K_B.mT @ unit[soft]
         batch = D.shape[:-2]
         arm = xp.sqrt((B[rigid] ** 2).sum(-1)).clip(1e-12)[:, None]
         fixed = [B[rigid] / arm, S[:n_q][held]]
@@ -235,8 +231,8 @@ class Reduction(nn.Module):
             fixed.append(rod / norm(rod).clip(1e-12)[..., None] @ S[:n_q])
         fixed = [part for part in fixed if len(part)]
         E = xp.concat([A, *(xp.broadcast_to(part, (*batch, *part.shape)) for part in fixed)], -2)
-        R = xp.zeros((E.shape[-2], n_a), **kind)
-        R[n_h : n_h + len(rigid)] = eye[rigid] / arm
+        R = zeros(D, E.shape[-2], n_a)
+        R[n_h : n_h + len(rigid)] = unit[rigid] / arm
         return ReducedStep(D, E, R, F, row_scale, B, K_a, rigid, soft, arm)
 
     def _solve(
@@ -289,14 +285,12 @@ class ReducedStep(NamedTuple):
 
     def actuator_force(self, step: KKTSolution, n_h: int) -> Float[AnyArray, "*batch n_a n_a"]:
         """dlam/da of a solution; 0 of slack tendons."""
-        n_a, J, xp = len(self.B), step.motion, namespace(step.motion)
-        kind = {"dtype": J.dtype, "device": J.device}
-        dlam = xp.zeros((*J.shape[:-2], n_a, n_a), **kind)
-        rigid, soft = self.rigid, self.soft
+        n_a, J, rigid, soft = len(self.B), step.motion, self.rigid, self.soft
+        dlam = zeros(J, *J.shape[:-2], n_a, n_a)
         dlam[..., rigid, :] = step.reaction[..., n_h : n_h + len(rigid), :] / self.arm
         if len(soft):
-            eye = xp.eye(n_a, **kind)
-            dlam[..., soft, :] = self.stiffness[soft, None] * (_left(self.B[soft].mT, J) - eye[soft])
+            pulled = _left(self.B[soft].mT, J) - eye(J, n_a)[soft]
+            dlam[..., soft, :] = self.stiffness[soft, None] * pulled
         return dlam
 
 

@@ -4,19 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from .._arrays import like, namespace
+from .._arrays import eye, like, namespace, zeros
 from ..contact.contact_kinematics import ContactKinematics
 from ..kinematics.se3 import cross, hat
 from ..typing import AnyArray, Bool, Float, Tensor
-
-
-def precedence(upstream: Bool[Tensor, "n_link n_q"]) -> Bool[Tensor, "n_q n_q"]:
-    """``[a, b]``: joint a is proximal to joint b on the same branch, or equal to it.
-
-    That is so where a moves every link that b moves.
-    """
-    moved = upstream.mT
-    return (moved[:, None, :] | ~moved[None, :, :]).all(-1)
 
 
 def geometric_stiffness(
@@ -41,10 +32,10 @@ def geometric_stiffness(
         kin: the contacts.
         force: ``f_i`` of the finger on the object, hand axes [N], held constant there.
         spin_moment: ``mu_4i`` about the inward normal [N m], held constant about the moving normal.
-        precedes: from :func:`precedence`.
+        precedes: ``[a, b]``: joint a is proximal to joint b on the same branch, or equal to it.
     """
-    n_q, xp = kin.axis.shape[-2], namespace(force)
-    D = xp.zeros((*force.shape[:-2], n_q + 6, n_q + 6), dtype=force.dtype, device=force.device)
+    n_q = kin.axis.shape[-2]
+    D = zeros(force, *force.shape[:-2], n_q + 6, n_q + 6)
     f_hat = hat(force)
     D[..., :n_q, :n_q] = posture_stiffness(force, kin.point_jacobian.mT, kin.axis, precedes)
     D[..., n_q + 3 :, n_q + 3 :] = -(f_hat @ hat(kin.lever)).sum(-3)
@@ -76,13 +67,6 @@ def _spin_terms(kin: ContactKinematics, spin_moment: AnyArray, precedes: Tensor)
     return D
 
 
-def spring_torque(
-    q: Float[AnyArray, "*batch n_q"], stiffness: Float[AnyArray, " n_q"], rest: Float[AnyArray, " n_q"]
-) -> Float[AnyArray, "*batch n_q"]:
-    """``V_q = K_s (q - q0)`` [N m]; ``stiffness`` is the diagonal of K_s [N m/rad]."""
-    return stiffness * (q - rest)
-
-
 def gravity_gradient(
     weight: Float[AnyArray, " 3"], com_lever: Float[AnyArray, "*batch 3"]
 ) -> Float[AnyArray, "*batch 6"]:
@@ -100,8 +84,7 @@ def gravity_hessian(
     weight: Float[AnyArray, " 3"], com_lever: Float[AnyArray, "*batch 3"]
 ) -> Float[AnyArray, "*batch 6 6"]:
     """``V_pp = blkdiag(0, -[m g]x [r_g]x)``, moving frame, not symmetric."""
-    batch, kind = com_lever.shape[:-1], {"dtype": com_lever.dtype, "device": com_lever.device}
-    result = namespace(com_lever).zeros((*batch, 6, 6), **kind)
+    result = zeros(com_lever, *com_lever.shape[:-1], 6, 6)
     result[..., 3:, 3:] = -hat(weight) @ hat(com_lever)
     return result
 
@@ -120,10 +103,10 @@ def posture_stiffness(
         force: ``f_i``, constant in hand axes [N].
         velocity: ``z_b x (x_i - o_b)``, zero where joint b does not move point i [m/rad].
         axis: ``z_a``.
-        precedes: joint a is proximal to joint b or equal to it.
+        precedes: as of :func:`geometric_stiffness`.
     """
     # f.(z_a x v_b) = (f x z_a).v_b, summed over points and components as one product
     turned = cross(force[..., :, None, :], axis[..., None, :, :]).mT
     turned, v = (x.reshape(*x.shape[:-3], -1, x.shape[-1]) for x in (turned, velocity.mT))
     upper = turned.mT @ v * like(precedes, axis)
-    return upper + upper.mT * ~namespace(axis).eye(upper.shape[-1], dtype=bool, device=axis.device)
+    return upper + upper.mT * (1 - eye(axis, upper.shape[-1]))

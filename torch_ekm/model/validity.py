@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from .._arrays import like, namespace, norm
-from .._checks import check_kind
+from .._checks import check_kind, check_last
 from ..contact.contact_set import LINK_MARGIN, ContactSet
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
@@ -27,16 +27,11 @@ _LOWEST = -0.9
 
 
 def check_described(hand: Any, obj: Any) -> None:
-    """A hand and an object, not their names, and in this order."""
-    for name, value, needs in (("hand", hand, "joint_names"), ("obj", obj, "mass")):
+    """A hand and an object, not their names, and in this order; the object with a mass [kg], which may be 0,
+    and a centre of mass [m]."""
+    for name, value, needs, kind in (("hand", hand, "joint_names", "hand"), ("obj", obj, "mass", "object")):
         if not hasattr(value, needs):
-            raise ParameterError(
-                name, value, f"a description: load_{'hand' if name == 'hand' else 'object'}(name)"
-            )
-
-
-def check_inertia(obj) -> None:
-    """Of anything with a mass [kg], which may be 0, and a centre of mass [m]."""
+            raise ParameterError(name, value, f"a description: load_{kind}(name)")
     mass, com = float(obj.mass), [float(x) for x in obj.com]
     if not 0 <= mass < math.inf:
         raise ParameterError("mass of the object", mass, "finite and not negative [kg]")
@@ -50,9 +45,7 @@ def check_state(
     """One entry for each joint, contacts with a batch of states, everything in the model's precision."""
     if contacts is not None:
         check_kind("contacts", contacts, ContactSet, "a ContactSet, e.g. model.contacts(state)")
-    if state.q.shape[-1] != hand.n_q:
-        names = ", ".join(hand.joint_names)
-        raise ShapeError("q", f"(*batch, {hand.n_q})", state.q.shape, f"the joints are: {names}")
+    check_last("q", state.q, hand.n_q, f"the joints are: {', '.join(hand.joint_names)}")
     if contacts is None and state.q.dim() > 1:
         raise ShapeError("q", f"({hand.n_q},)", state.q.shape, "for a batch give the contacts too")
     for name, given in (("state", state.q), ("contacts", None if contacts is None else contacts.gap)):
@@ -93,10 +86,7 @@ def at_pads(
         valid = f"finite or NaN, and above {_LOWEST} N: a pad cannot pull (is its zero or its sign wrong?)"
         raise ParameterError("fingertip_force", fingertip_force.tolist(), valid)
     pads = [pad.name for pad in hand.pads]
-    if fingertip_force.shape[-1:] != (len(pads),):
-        raise ShapeError(
-            "fingertip_force", f"(*batch, {len(pads)})", fingertip_force.shape, f"pads: {', '.join(pads)}"
-        )
+    check_last("fingertip_force", fingertip_force, len(pads), f"pads: {', '.join(pads)}")
     measured = {name: fingertip_force[..., i] for i, name in enumerate(pads)}
     for name, link in zip(contacts.finger, contacts.link, strict=True):
         if name not in pads and name != link:
@@ -158,7 +148,7 @@ def find_doubts(
     forces: GraspForces,
     stability: Float[Tensor, "*batch"],
     reused: bool,
-    measured: dict[str, Any] | None = None,
+    measured: dict[str, Any],
     before: tuple[str, ...] = (),
 ) -> tuple[Doubt, ...]:
     """All that can be said against a state, worst kind first.
@@ -168,28 +158,27 @@ def find_doubts(
         measured: normal forces that the pads measure, by pad [N].
         before: the pads that touched a step before.
     """
-    doubts = _of_stability(stability, options) + _of_links(contacts)
+    doubts = [*_of_stability(stability, options), *_of_near_misses(contacts, measured, before, options)]
     if forces.solved:
-        doubts += _of_torque(joint_names, forces, options) + _of_friction(contacts, forces)
-        doubts += _of_sensors(contacts, forces, measured or {}, options)
+        doubts += _of_torque(joint_names, forces, options)
+        doubts += _of_friction(contacts, forces)
+        doubts += _of_sensors(contacts, forces, measured, options)
     else:
         doubts.append(_of_missing_forces(forces, reused))
-    doubts += _of_dropped_contacts(contacts, measured or {}, before, options)
     return tuple(sorted(doubts, key=lambda doubt: _ORDER[doubt.kind]))
 
 
 _ORDER = {kind: place for place, kind in enumerate(ModelStatus)}
 
 
-def _of_stability(stability: Tensor, options: ModelOptions) -> list[Doubt]:
+def _of_stability(stability: Tensor, options: ModelOptions) -> Iterator[Doubt]:
     least = float(stability.min())
-    if least > 0 or options.on_unstable != "flag":
-        return []
-    message = (
-        f"the stiffness with locked actuators has the eigenvalue {least:.3g} N m/rad: the grasp buckles and "
-        "J_m is formal; grip less hard or place the fingers wider"
-    )
-    return [Doubt(ModelStatus.UNSTABLE, "grasp", least, 0.0, "N m/rad", message)]
+    if least <= 0 and options.on_unstable == "flag":
+        message = (
+            f"the stiffness with locked actuators has the eigenvalue {least:.3g} N m/rad: the grasp buckles "
+            "and J_m is formal; grip less hard or place the fingers wider"
+        )
+        yield Doubt(ModelStatus.UNSTABLE, "grasp", least, 0.0, "N m/rad", message)
 
 
 def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
@@ -209,44 +198,37 @@ def _of_missing_forces(forces: GraspForces, reused: bool) -> Doubt:
     return Doubt(kind, "grasp", missing, 0.0, "N", message)
 
 
-def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOptions) -> list[Doubt]:
+def _of_torque(joint_names: Sequence[str], forces: GraspForces, options: ModelOptions) -> Iterator[Doubt]:
     std = options.forces.torque_std
     residual = as_states(forces.residual, 1)
     size = norm(residual)
     value = float(size.max())
-    if value <= SIGMA * std:
-        return []
-    joint = joint_names[int(abs(residual[int(size.argmax())]).argmax())]
-    message = (
-        f"springs, weight and contacts leave joint torques of {value:.3f} N m unexplained ({value / std:.0f} "
-        f"standard deviations), most at '{joint}': the object's mass, a spring, its rest angle or the "
-        "contacts are not as described"
-    )
-    return [Doubt(ModelStatus.UNEXPLAINED_TORQUE, joint, value, SIGMA * std, "N m", message)]
+    if value > SIGMA * std:
+        joint = joint_names[int(abs(residual[int(size.argmax())]).argmax())]
+        message = (
+            f"springs, weight and contacts leave joint torques of {value:.3f} N m unexplained "
+            f"({value / std:.0f} standard deviations), most at '{joint}': the object's mass, a spring, its "
+            "rest angle or the contacts are not as described"
+        )
+        yield Doubt(ModelStatus.UNEXPLAINED_TORQUE, joint, value, SIGMA * std, "N m", message)
 
 
-def _of_friction(contacts: ContactSet, forces: GraspForces) -> list[Doubt]:
-    least = as_states(forces.relative_margin, 1).min(0)
-    if float(least.min()) > AT_LIMIT:
-        return []
-    margin = as_states(forces.margin, 1).min(0)
-    doubts = []
-    for i, pad in enumerate(contacts.finger):
-        if float(least[i]) <= AT_LIMIT and float(contacts.friction[i]) > 0:
+def _of_friction(contacts: ContactSet, forces: GraspForces) -> Iterator[Doubt]:
+    least = as_states(forces.relative_margin, 1).min(0).tolist()
+    for i, (pad, value) in enumerate(zip(contacts.finger, least, strict=True)):
+        if value <= AT_LIMIT and float(contacts.friction[i]) > 0:
+            left = float(as_states(forces.margin, 1)[:, i].min())
             message = (
-                f"pad '{pad}' is at its friction limit ({float(margin[i]):.2f} N to spare) and may slip; "
+                f"pad '{pad}' is at its friction limit ({left:.2f} N to spare) and may slip; "
                 "grip harder or turn less"
             )
-            value = float(least[i])
-            doubts.append(Doubt(ModelStatus.FRICTION_LIMIT, pad, value, AT_LIMIT, "mu_s f_n", message))
-    return doubts
+            yield Doubt(ModelStatus.FRICTION_LIMIT, pad, value, AT_LIMIT, "mu_s f_n", message)
 
 
 def _of_sensors(
     contacts: ContactSet, forces: GraspForces, measured: dict[str, Any], options: ModelOptions
-) -> list[Doubt]:
-    doubts, limit = [], SIGMA * options.forces.normal_std
-    normal = as_states(forces.normal, 1)
+) -> Iterator[Doubt]:
+    limit, normal = SIGMA * options.forces.normal_std, as_states(forces.normal, 1)
     for i, pad in enumerate(contacts.finger):
         if pad not in measured:
             continue
@@ -257,46 +239,28 @@ def _of_sensors(
                 f"pad '{pad}' measures a normal force {value:.2f} N off the one that balances object and "
                 "joints; check its calibration, the object's mass and whether something else touches"
             )
-            doubts.append(Doubt(ModelStatus.SENSORS_DISAGREE, pad, value, limit, "N", message))
-    return doubts
+            yield Doubt(ModelStatus.SENSORS_DISAGREE, pad, value, limit, "N", message)
 
 
-def _of_links(contacts: ContactSet) -> list[Doubt]:
-    return [
-        Doubt(
-            ModelStatus.LINK_TOUCHES,
-            near.link,
-            near.gap,
-            LINK_MARGIN,
-            "m",
-            f"link '{near.link}' carries no pad and touches the object (gap {1e3 * near.gap:.1f} mm): its "
-            "force is left out; grasp elsewhere, or give the link a pad in the transmission file",
-        )
-        for near in contacts.near_misses
-        if near.pad is None
-    ]
-
-
-def _of_dropped_contacts(
+def _of_near_misses(
     contacts: ContactSet, measured: dict[str, Any], before: tuple[str, ...], options: ModelOptions
-) -> list[Doubt]:
-    doubts, margin = [], options.contact_margin
+) -> Iterator[Doubt]:
+    margin = options.contact_margin
     for near in contacts.near_misses:
         if near.pad is None:
+            message = (
+                f"link '{near.link}' carries no pad and touches the object (gap {1e3 * near.gap:.1f} mm): "
+                "its force is left out; grasp elsewhere, or give the link a pad in the transmission file"
+            )
+            yield Doubt(ModelStatus.LINK_TOUCHES, near.link, near.gap, LINK_MARGIN, "m", message)
             continue
         pressed = near.pad in measured and float(measured[near.pad].max()) > SIGMA * options.forces.normal_std
         if not (near.gap <= 1.5 * margin or near.pad in before or pressed):
             continue
-        why = (
-            "measures a force"
-            if pressed
-            else "touched a step before"
-            if near.pad in before
-            else "nearly touches"
-        )
+        earlier = "touched a step before" if near.pad in before else "nearly touches"
+        why = "measures a force" if pressed else earlier
         message = (
             f"pad '{near.pad}' {why} but is {1e3 * near.gap:.1f} mm from the object and left out; "
             f"ModelOptions(contact_margin={near.gap + 1e-4:.4f}) takes it in, if the poses are that inexact"
         )
-        doubts.append(Doubt(ModelStatus.CONTACT_DROPPED, near.pad, near.gap, margin, "m", message))
-    return doubts
+        yield Doubt(ModelStatus.CONTACT_DROPPED, near.pad, near.gap, margin, "m", message)

@@ -12,8 +12,7 @@ from .hall_calibration import HallCalibration
 from .joint_estimator import JointEstimator
 from .vision.board import MarkerBoard
 from .vision.camera import PinholeCamera
-from .vision.track import Track, TrackStatus
-from .vision.tracker import MarkerTracker
+from .vision.tracker import MarkerTracker, Track, TrackStatus
 
 __all__ = [
     "HallCalibration",

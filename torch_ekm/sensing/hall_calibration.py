@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from .._checks import check_finite
+from .._checks import check_finite, check_last
 from ..exceptions import CalibrationError, ParameterError, ShapeError
 from ..typing import Bool, Float, Tensor
 
@@ -62,15 +62,14 @@ class HallChannel:
     def estimate(self, n: Float[Tensor, "*batch"]) -> tuple[Tensor, ...]:
         """As :class:`HallEstimate`, of this channel's readings; its two bounds one after the other."""
         held = n.clamp(self.low, self.high)  # noise may carry a sound reading past the range of the sweep
-        r, c = held / _FULL_SCALE, self.coefficients
-        q, slope = self.angle(held), _slope(c, r)
+        q, slope = self.angle(held), _slope(self.coefficients, held / _FULL_SCALE)
         std = ((slope * self.noise) ** 2 + self.misfit**2).sqrt()
         lower, upper = torch.full_like(q, -torch.inf), torch.full_like(q, torch.inf)
         # the angles that a reading of 0, one of 255, and a stuck channel leave open
         first, last = sorted((self.angle(self.low), self.angle(self.high)))
-        ends = [(self.angle_min, first), (last, self.angle_max)]
+        ends = (self.angle_min, first), (last, self.angle_max)
         if self.angle(self.high) <= self.angle(self.low):
-            ends.reverse()
+            ends = ends[::-1]
         blind = n <= 0, n >= _FULL_SCALE, torch.full_like(n, self.stuck, dtype=torch.bool)
         for pinned, (least, most) in zip(blind, (*ends, (self.angle_min, self.angle_max)), strict=True):
             q = torch.where(pinned, (least + most) / 2, q)
@@ -142,8 +141,7 @@ class HallCalibration:
             ShapeError: the last dimension is not the number of channels.
             NonFiniteError: a reading is NaN.
         """
-        if readings.ndim == 0 or readings.shape[-1] != len(self.channels):
-            raise ShapeError("readings", f"(*batch, {len(self.channels)})", readings.shape)
+        check_last("readings", readings, len(self.channels))
         check_finite("readings", readings)
         channels = zip(self.channels, readings.to(torch.float64).unbind(-1), strict=True)
         columns = zip(*(channel.estimate(n) for channel, n in channels), strict=True)
@@ -169,7 +167,13 @@ def _fit(joint: str, readings: Float[Tensor, " n"], angles: Float[Tensor, " n"])
     # the default driver, gelsy, gave other last digits for the same input from call to call
     c = torch.linalg.lstsq(V, y[:, None], driver="gelsd").solution[:, 0]
     low, high = float(x.min()), float(x.max())
-    _check_monotone(name, c, low, high)
+    among = torch.linspace(low, high, 512, dtype=torch.float64)
+    sign = torch.sign(_slope(c, among / _FULL_SCALE))
+    if len(turning := torch.nonzero(sign[1:] != sign[:-1])):
+        at = float(among[turning[0, 0]])
+        problem = f"the fitted curve turns back at reading {at:.1f}, within {low:.0f}..{high:.0f}"
+        remedy = "sweep the joint over its whole range, slowly, without readings taken while it was blocked"
+        raise CalibrationError(name, f"{problem}; {remedy}")
     residual = y - V @ c
     noise, misfit = _split(residual, _slope(c, r))
     c0, c1, c2, c3 = (float(value) for value in c)
@@ -181,18 +185,6 @@ def _slope(c: Any, r: Any) -> Any:
     return (c[1] + r * (2 * c[2] + 3 * r * c[3])) / _FULL_SCALE
 
 
-def _check_monotone(name: str, c: Tensor, low: float, high: float) -> None:
-    """``q'(r) = c_1 + 2 c_2 r + 3 c_3 r^2`` must not change its sign between the ends."""
-    r = torch.linspace(low, high, 512, dtype=torch.float64) / _FULL_SCALE
-    slope = _slope(c, r)
-    turning = torch.nonzero(torch.sign(slope[1:]) != torch.sign(slope[:-1]))
-    if len(turning):
-        at = float(r[turning[0, 0]]) * _FULL_SCALE
-        problem = f"the fitted curve turns back at reading {at:.1f}, within {low:.0f}..{high:.0f}"
-        remedy = "sweep the joint over its whole range, slowly, without readings taken while it was blocked"
-        raise CalibrationError(name, f"{problem}; {remedy}")
-
-
 def _split(residual: Tensor, slope: Tensor) -> tuple[float, float]:
     """``E r^2 = slope^2 sigma_n^2 + sigma_m^2``: regression of squares, both parts non-negative."""
     square, s2 = residual**2, slope**2
@@ -200,7 +192,7 @@ def _split(residual: Tensor, slope: Tensor) -> tuple[float, float]:
     variance = ((s2 - s2_mean) ** 2).mean()
     floor = 1.0 / 12  # rounding to whole counts
     noise2 = float(((s2 - s2_mean) * (square - square_mean)).mean() / variance) if variance > 0 else floor
-    noise2 = min(max(noise2, floor), float(square_mean / s2_mean) if s2_mean > 0 else floor)
-    noise2 = max(noise2, floor)
+    most = float(square_mean / s2_mean) if s2_mean > 0 else floor
+    noise2 = max(min(noise2, most), floor)
     misfit2 = max(float(square_mean) - noise2 * float(s2_mean), 0.0)
     return noise2**0.5, misfit2**0.5

@@ -4,11 +4,11 @@ from typing import NamedTuple
 
 import torch
 
-from .._checks import check_finite
+from .._checks import check_finite, check_shape
 from .._noise import NOISE
 from ..description import HandDescription
 from ..estimation.parameter_filter import update
-from ..exceptions import JointMismatchError, ShapeError
+from ..exceptions import JointMismatchError
 from ..typing import Float, Tensor
 from .hall_calibration import HallCalibration, HallEstimate
 
@@ -66,8 +66,7 @@ class JointEstimator:
         Raises:
             ShapeError, NonFiniteError: readings or encoders that cannot be right.
         """
-        if actuators.ndim == 0 or actuators.shape != (*readings.shape[:-1], self.hand.n_a):
-            raise ShapeError("actuators", f"{(*readings.shape[:-1], self.hand.n_a)}", actuators.shape)
+        check_shape("actuators", actuators, (*readings.shape[:-1], self.hand.n_a))
         check_finite("actuators", actuators)
         hall = self.calibration.estimate(readings)
         way = actuators.to(torch.float64) - self._offset

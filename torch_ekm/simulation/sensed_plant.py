@@ -14,8 +14,7 @@ from ..plant import Observation, Plant, PlantStatus, PlantWrapper, Truth
 from ..sensing.hall_calibration import HallCalibration
 from ..sensing.joint_estimator import JointEstimator
 from ..sensing.vision.board import MarkerBoard
-from ..sensing.vision.track import Track
-from ..sensing.vision.tracker import MarkerTracker
+from ..sensing.vision.tracker import MarkerTracker, Track
 from ..typing import Array, Tensor
 from .hall_sensors import HallSensors
 from .imaging.card_scene import CardScene, camera_facing, grasp_scene

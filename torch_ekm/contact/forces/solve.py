@@ -76,7 +76,7 @@ class Optimum(NamedTuple):
 
 
 def solve_by_active_set(program: EqualityProgram, G: Array, h: Array, active: list[int]) -> Optimum | None:
-    """The optimum with ``G x <= h``, by guessing which rows W hold with equality::
+    """The optimum with ``G x <= h``, by guessing which rows W hold with equality, ``active`` first::
 
         P x + q + A^T nu + G_W^T lam = 0,  A x = b,  G_W x = h_W,  lam >= 0,  G x <= h
 
@@ -85,9 +85,6 @@ def solve_by_active_set(program: EqualityProgram, G: Array, h: Array, active: li
     where none is found (None) an interior-point method has to do it. At a vertex, where as many rows hold as
     there are unknowns, rounding decides which row leaves, and none may be found. See Nocedal and Wright,
     Numerical Optimization (2006), ch. 16.
-
-    Args:
-        active: the first guess.
     """
     rows = list(active)
     for _ in range(_MOST_CHANGES):

@@ -4,6 +4,5 @@ from __future__ import annotations
 
 from .calibrate import calibrate
 from .parameters import Calibrated, Calibration
-from .residuals import Recording
 
-__all__ = ["Calibrated", "Calibration", "Recording", "calibrate"]
+__all__ = ["Calibrated", "Calibration", "calibrate"]

@@ -30,13 +30,7 @@ PRIORS = {
 """Kinds of parameters, and how far off each may well be (one standard deviation): of the logarithm for
 springs, moment arms and stiffness, else [rad]."""
 _LOGARITHMIC = ("springs", "moment_arms", "stiffness")
-_WORDS = {
-    "springs": "spring",
-    "rest": "rest angle",
-    "stiffness": "stiffness",
-    "offset": "offset",
-    "backlash": "backlash",
-}
+_WORDS = {"springs": "spring", "rest": "rest angle", "moment_arms": "moment arm"}  # else the kind itself
 
 
 @dataclass(frozen=True)
@@ -54,9 +48,7 @@ class Parameter:
     @property
     def label(self) -> str:
         """What the parameter is called in tables and messages."""
-        if self.kind == "moment_arms":
-            return f"moment arm of {self.name}"
-        return f"{_WORDS[self.kind]} of {self.name}"
+        return f"{_WORDS.get(self.kind, self.kind)} of {self.name}"
 
     @property
     def logarithmic(self) -> bool:

@@ -57,10 +57,6 @@ class StepProblem:
     mu_s: Array
     """``(n_c,)``."""
 
-    def gaps(self, z: Array, lam: Array) -> Array:
-        """w."""
-        return self.gap + self.E @ z + self.compliance * (lam - self.before)
-
     def slides(self, z: Array, t: Array) -> Array:
         """v."""
         return self.way + self.T @ z + self.tangential_compliance * (t - self.t_before)
@@ -92,12 +88,8 @@ class StepSolution(NamedTuple):
     """Of the residual with respect to ``[z; lam; t]``."""
 
     def response(self, load: Array, gap: Array) -> Response:
-        """Derivative of the answer in its mode, by parameters that change ``load`` and ``gap``.
-
-        Args:
-            load: at these rates, ``(n_z, k)``.
-            gap: likewise, ``(m, k)``.
-        """
+        """Derivative of the answer in its mode, by k parameters that change the load at the rates ``load``
+        ``(n_z, k)`` and the gaps at the rates ``gap`` ``(m, k)``."""
         n_z, (m, k) = len(load), gap.shape
         rates = np.zeros((len(self.jacobian), k))
         rates[:n_z] = load

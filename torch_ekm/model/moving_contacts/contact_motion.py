@@ -218,29 +218,11 @@ class ContactMotion:
             NoContactError: nothing bears.
             GraspEndsError: no equilibrium is near.
         """
-        grasp, laws = self._grasp, self._laws
-        n_c, still = grasp.contacts.n_c, np.zeros(laws.S.shape[1])
-        done = self._solve(
-            grasp, self.loads, Way(grasp, self.loads.pull, delta_a.detach().double().numpy(), still)
-        )
+        grasp, loads, still = self._grasp, self.loads, np.zeros(self._laws.S.shape[1])
+        done = self._solve(grasp, loads, Way(grasp, loads.pull, delta_a.detach().double().numpy(), still))
         if done is None:
             raise self._why()
-        bears = np.flatnonzero(done.answer.active[:n_c])
-        if not len(bears):
-            raise NoContactError("no finger touches the object after this motion")
-        program, rates = done.program, laws.response(grasp, done.program.problem, done.answer)
-        turn = np.einsum("idz,za->ida", grasp.turn, rates.z)  # of the frames that the forces turned with
-        return mode_linearization(
-            self.model,
-            grasp,
-            self.loads,
-            bears.tolist(),
-            motion=laws.S @ rates.z,
-            normal=rates.lam[:n_c] + np.einsum("id,ida->ia", program.t, turn),
-            tangential=rates.t - program.lam[:n_c, None, None] * turn,
-            actuator=laws.actuator_response(grasp, rates, n_c),
-            stop=laws.stop_torque(program, done.answer),
-        )
+        return mode_linearization(self._laws, grasp, loads, done.program, done.answer)
 
     def answered(self, lin: Linearization) -> Linearization:
         """A linearization of this state with ``df_n/da`` by the figures that are known, as motions have them:

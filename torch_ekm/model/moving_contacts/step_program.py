@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from ...contact.forces.problem import ForceStatus, friction_cones, margins
+from ...exceptions import NoContactError
 from ...typing import Array
 from ..force_balance import pack_forces
 from ..linearization import Linearization
@@ -16,68 +17,6 @@ from ..reduction import Drives, sensitivities
 from ..validity import find_doubts
 from .contact_laws import Response, StepProblem, StepSolution
 from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
-
-
-def mode_linearization(
-    model: GraspModel,
-    grasp: PlacedGrasp,
-    loads: ContactLoads,
-    bears: list[int],
-    motion: Array,
-    normal: Array,
-    tangential: Array,
-    actuator: Array,
-    stop: Array,
-) -> Linearization:
-    """``J_m`` and the force sensitivities of the contacts that bear.
-
-    Args:
-        model: of hand and object.
-        grasp: the state.
-        loads: forces there.
-        bears: indices of the contacts of ``grasp`` that are kept.
-        motion: ds/da, ``(n_s, n_a)``.
-        normal, tangential: change of the forces of all contacts in their frames, ``(n_c, n_a)``,
-            ``(n_c, d, n_a)`` [scaled].
-        actuator: dlam/da, ``(n_a, n_a)``.
-        stop: torque of the joints' stops after the motion [N m].
-    """
-    contacts = grasp.contacts.select(bears)
-    kin = model.contact_kinematics(grasp.state, contacts)
-    lam, t = grasp.components(loads)
-    mu, dmu = [], []
-    for i, one in zip(bears, kin.models, strict=True):
-        scale = np.array([1.0, 1.0, grasp.spin_scale[i] * L])[: len(one.rows) - 1] / L
-        mu += [lam[i] / L, *(t[i, : len(scale)] * scale)]
-        dmu += [normal[i] / L, *(tangential[i, : len(scale)] * scale[:, None])]
-    mu_t, dmu_t, J = torch.tensor(mu), torch.from_numpy(np.stack(dmu)), torch.from_numpy(motion)
-    cones = friction_cones(kin.models, contacts.friction.tolist(), contacts.torsional_friction.tolist())
-    margin, relative = (torch.from_numpy(x) for x in margins(cones, mu_t.numpy()))
-    forces = pack_forces(
-        kin,
-        mu=mu_t,
-        lam=-torch.from_numpy(loads.pull),
-        residual=torch.zeros(model.hand.n_q, dtype=torch.float64),
-        stop_torque=torch.from_numpy(loads.stop),
-        margin=margin,
-        relative_margin=relative,
-        violation=torch.zeros((), dtype=torch.float64),
-        status=(ForceStatus.SOLVED,),
-        loop=torch.from_numpy(loads.loop),
-    )
-    stability = torch.tensor(torch.inf, dtype=torch.float64)
-    return Linearization(
-        state=grasp.state,
-        contacts=contacts,
-        forces=forces,
-        **sensitivities(kin, forces, J, dmu_t),
-        actuator_force_sensitivity=torch.from_numpy(actuator),
-        held_joints=torch.from_numpy(stop != 0),
-        stability=stability,
-        options=model.options,
-        doubts=find_doubts(model.options, model.hand.joint_names, contacts, forces, stability, reused=False),
-    )
-
 
 COMPLIANCE = 1e-6
 """Of contacts and stops [rad/(N m)]."""
@@ -120,8 +59,7 @@ class HandLaws:
     """
 
     def __init__(self, model: GraspModel, drives: Drives) -> None:
-        hand = model.hand
-        self.hand = hand
+        self.model, self.hand = model, (hand := model.hand)
         self.joints, self.S = model.reduction.joint_basis.numpy(), model.reduction.scaled_basis.numpy()
         self.J_a, self.K = (x.detach().double().numpy() for x in drives)
         self._B = np.zeros((hand.n_a, self.S.shape[1]))
@@ -156,9 +94,7 @@ class HandLaws:
         """Of what is left of a step.
 
         Args:
-            here: where it has come to.
-            loads: forces there.
-            way: how it came there.
+            here: where it has come to, with the forces ``loads``.
             gap: of the contacts [m].
             load: constant, of all equilibria [scaled].
             damping: added to the stiffness [N m/rad].
@@ -264,3 +200,57 @@ def _slid(here: PlacedGrasp, first: PlacedGrasp, total: Array) -> Array:
             begun[:n] = here.frame[i][:, 1 : 1 + n].T @ first.frame[j][:, 1 : 1 + n] @ begun[:n]
             way[i] += begun
     return way
+
+
+def mode_linearization(
+    laws: HandLaws, grasp: PlacedGrasp, loads: ContactLoads, program: StepProgram, answer: StepSolution
+) -> Linearization:
+    """``J_m`` and the force sensitivities of the contacts that bear after a step that begins at a grasp with
+    these loads.
+
+    Raises:
+        NoContactError: nothing bears.
+    """
+    model, n_c = laws.model, grasp.contacts.n_c
+    bears = np.flatnonzero(answer.active[:n_c]).tolist()
+    if not bears:
+        raise NoContactError("no finger touches the object after this motion")
+    rates = laws.response(grasp, program.problem, answer)
+    turn = np.einsum("idz,za->ida", grasp.turn, rates.z)  # of the frames that the forces turned with
+    normal = rates.lam[:n_c] + np.einsum("id,ida->ia", program.t, turn)
+    tangential = rates.t - program.lam[:n_c, None, None] * turn
+    stop = laws.stop_torque(program, answer)
+    contacts = grasp.contacts.select(bears)
+    kin = model.contact_kinematics(grasp.state, contacts)
+    lam, t = grasp.components(loads)
+    mu, dmu = [], []
+    for i, one in zip(bears, kin.models, strict=True):
+        scale = np.array([1.0, 1.0, grasp.spin_scale[i] * L])[: len(one.rows) - 1] / L
+        mu += [lam[i] / L, *(t[i, : len(scale)] * scale)]
+        dmu += [normal[i] / L, *(tangential[i, : len(scale)] * scale[:, None])]
+    cones = friction_cones(kin.models, contacts.friction.tolist(), contacts.torsional_friction.tolist())
+    margin, relative = (torch.from_numpy(x) for x in margins(cones, np.array(mu)))
+    forces = pack_forces(
+        kin,
+        mu=torch.tensor(mu),
+        lam=-torch.from_numpy(loads.pull),
+        residual=torch.zeros(laws.hand.n_q, dtype=torch.float64),
+        stop_torque=torch.from_numpy(loads.stop),
+        margin=margin,
+        relative_margin=relative,
+        violation=torch.zeros((), dtype=torch.float64),
+        status=(ForceStatus.SOLVED,),
+        loop=torch.from_numpy(loads.loop),
+    )
+    stability = torch.tensor(torch.inf, dtype=torch.float64)
+    return Linearization(
+        state=grasp.state,
+        contacts=contacts,
+        forces=forces,
+        **sensitivities(kin, forces, torch.from_numpy(laws.S @ rates.z), torch.from_numpy(np.stack(dmu))),
+        actuator_force_sensitivity=torch.from_numpy(laws.actuator_response(grasp, rates, n_c)),
+        held_joints=torch.from_numpy(stop != 0),
+        stability=stability,
+        options=model.options,
+        doubts=find_doubts(model.options, laws.hand.joint_names, contacts, forces, stability, False, {}),
+    )

@@ -89,11 +89,10 @@ class MarkerBoard:
         pitch, s = self.marker_size + self.gap, self.marker_size
         width, height = self.size
         square = np.array([[0, 0], [s, 0], [s, -s], [0, -s]])
+        row, column = np.divmod(np.arange(self.n_markers), self.columns)
+        left, upper = -width / 2 + self.margin + column * pitch, height / 2 - self.margin - row * pitch
         corners = np.zeros((self.n_markers, 4, 3))
-        for k in range(self.n_markers):
-            row, column = divmod(k, self.columns)
-            upper_left = [-width / 2 + self.margin + column * pitch, height / 2 - self.margin - row * pitch]
-            corners[k, :, :2] = upper_left + square
+        corners[:, :, :2] = np.stack([left, upper], axis=-1)[:, None] + square
         return corners
 
     @cached_property

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ..._extras import require
@@ -242,7 +241,7 @@ def projection_jacobian(camera: PinholeCamera, X: Array, rotation: Array, positi
     rvec = cv2.Rodrigues(rotation)[0]
     _, full = cv2.projectPoints(X, rvec, position, camera.matrix, camera.distortion_array)
     by_position = full[:, 3:6].reshape(-1, 2, 3)  # dpi/dx, since x = R X + t
-    by_rotation = -by_position @ hat(torch.from_numpy(X @ rotation.T)).numpy()
+    by_rotation = -by_position @ hat(X @ rotation.T)
     return np.concatenate([by_position, by_rotation], axis=-1)
 
 

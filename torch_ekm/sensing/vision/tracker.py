@@ -1,23 +1,71 @@
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..._extras import require
-from ...exceptions import ParameterError, ShapeError
+from ...exceptions import ObjectLostError, ParameterError, ShapeError
 from ...kinematics.se3 import hat
-from ...typing import Array
+from ...typing import Array, Float, Tensor
 from .board import MarkerBoard, get_dictionary
 from .board_pose import BoardPose, angle_between, estimate_board_pose
 from .camera import PinholeCamera
-from .track import Track, TrackStatus
 
 _MAX_STEP, _MAX_TURN = 0.020, float(np.radians(20.0))  # believable between two frames [m], [rad]
 _MIN_MARKERS = 2  # of a board that must be seen: one alone is prone to flips
 _JUMP_FRAMES = 3  # a jump is accepted when that many frames in a row agree on it
+
+
+class TrackStatus(Enum):
+    """Why there is a pose, or none."""
+
+    OK = "ok"
+    NO_IMAGE = "no_image"  # the frame was dropped
+    PALM_HIDDEN = "palm_hidden"  # too few markers of the palm's board were found
+    OBJECT_HIDDEN = "object_hidden"  # too few markers of the object's board were found
+    AMBIGUOUS = "ambiguous"  # two mirrored poses fit, and no earlier frame decides which
+    JUMP = "jump"  # the pose is too far from the last one; accepted when seen repeatedly
+
+
+@dataclass(frozen=True)
+class Track:
+    """Pose of the object in the hand frame, or the reason why there is none.
+
+    ``position``, ``rotation`` and ``covariance`` are None unless ``status`` is OK.
+    """
+
+    status: TrackStatus
+    position: Float[Tensor, " 3"] | None = None
+    """Origin of the object's frame [m], float64."""
+    rotation: Float[Tensor, "3 3"] | None = None
+    covariance: Float[Tensor, "6 6"] | None = None
+    """Of the error twist ``(v; w)`` about the object's origin, hand axes [m, rad]."""
+    palm: BoardPose | None = None
+    """The palm's board in the camera frame, where it was found in this image."""
+    object: BoardPose | None = None
+    """The object's board in the camera frame, where it was found."""
+    markers: Mapping[int, NDArray[np.float64]] = field(default_factory=dict)
+    """Corners ``(4, 2)`` [px] of each marker of both boards that was found, by its number."""
+
+    @property
+    def ok(self) -> bool:
+        return self.status is TrackStatus.OK
+
+    def pose(self) -> tuple[Float[Tensor, " 3"], Float[Tensor, "3 3"]]:
+        """``(position, rotation)``.
+
+        Raises:
+            ObjectLostError: there is none in this frame.
+        """
+        if self.position is None or self.rotation is None:
+            remedy = "take the next frame, or clear the line of sight"
+            raise ObjectLostError(f"no pose in this frame: {self.status.value}; {remedy}")
+        return self.position, self.rotation
 
 
 class MarkerTracker:
@@ -113,11 +161,10 @@ class MarkerTracker:
         arm = -R_co @ t_ob  # from the card's centre to the object's origin, camera axes
         reach = obj.position + arm - palm.position
         position = M @ reach + t_hp
-        zero = np.zeros((3, 3))
-        across, apart = hat(torch.from_numpy(np.stack([arm, reach]))).numpy()
-        by_object = np.block([[M, -M @ across], [zero, M]])
-        by_palm = -np.block([[M, -M @ apart], [zero, M]])
-        covariance = by_object @ obj.covariance @ by_object.T + by_palm @ palm.covariance @ by_palm.T
+        covariance = np.zeros((6, 6))
+        for board, lever in ((obj, arm), (palm, reach)):
+            J = np.block([[M, -M @ hat(lever)], [np.zeros((3, 3)), M]])
+            covariance = covariance + J @ board.covariance @ J.T
         return position, M @ R_co, covariance
 
     def _believable(self, position: Array, rotation: Array) -> bool:
