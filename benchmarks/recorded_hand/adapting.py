@@ -11,6 +11,7 @@ from torch_ekm.contact.contact_set import VARYING
 from torch_ekm.description import HandDescription
 from torch_ekm.estimation.hand_figures import HandFigures
 from torch_ekm.exceptions import GraspError
+from torch_ekm.experiments.learner_comparison.run import repeatable
 from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel, Linearization
 from torch_ekm.typing import Array
@@ -40,9 +41,7 @@ def adapting_predictions(
     obj = cylinder(0.045)  # its mass alone counts, and that not in the plane
     figures, found = HandFigures.of(hand), {}
     model = KinematicModel(hand, obj, OPTIONS).with_figures(figures)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # small matrices: more threads only wait for each other
-    try:
+    with repeatable():
         for name in order:
             taken, at = samples[name], states[name]
             contacts, grasps, c, s = at.contact_set(obj.friction), at.grasps(), *_turn(at)
@@ -59,8 +58,6 @@ def adapting_predictions(
                 if float(lin.object_jacobian[:2].abs().max()) < LARGEST:
                     found[name][k] = c[row] * x - s[row] * y, s[row] * x + c[row] * y, angle
                     figures.learn(lin, moved, _increment(lin, taken, k, at, c[row], s[row]))
-    finally:
-        torch.set_num_threads(threads)
     return found
 
 

@@ -31,7 +31,7 @@ from .nominal import (
     through_play,
 )
 from .recordings import APART, RecordedPath, known_diameter, read_recordings
-from .scores import Row, score
+from .report import Row, score
 from .states import States, estimate_states
 from .synthetic import write_synthetic
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
+from torch_ekm.experiments.learner_comparison.run import repeatable
 from torch_ekm.experiments.learners import learner_factory
 from torch_ekm.typing import Array
 
@@ -39,22 +40,16 @@ def learned_predictions(
     """
     centre, scale = _units(_inputs(nominal, samples[apart], states[apart]))
     unit = _spread(samples[apart].motion - predicted[apart])
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # small matrices: more threads only wait for each other
     found = {name: predicted[name].copy() for name in order}
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            model = learner_factory(learner)(len(centre), 3)
-            for name in order:
-                taken = samples[name]
-                x = torch.from_numpy((_inputs(nominal, taken, states[name]) - centre) / scale)[:limit]
-                left = torch.from_numpy((taken.motion - predicted[name]) / unit)[:limit]
-                parts = np.unique(taken.path[:limit], return_counts=True)[1].tolist()
-                model.new_sequence()
-                found[name][:limit] += unit * run_prequential(model, x, left, parts).mean.numpy()
-    finally:
-        torch.set_num_threads(threads)
+    with repeatable():
+        model = learner_factory(learner)(len(centre), 3)
+        for name in order:
+            taken = samples[name]
+            x = torch.from_numpy((_inputs(nominal, taken, states[name]) - centre) / scale)[:limit]
+            left = torch.from_numpy((taken.motion - predicted[name]) / unit)[:limit]
+            parts = np.unique(taken.path[:limit], return_counts=True)[1].tolist()
+            model.new_sequence()
+            found[name][:limit] += unit * run_prequential(model, x, left, parts).mean.numpy()
     return found
 
 
