@@ -18,9 +18,8 @@ from torch_ekm.experiments.learners import LEARNERS
 from torch_ekm.model.calibration import Calibration
 from torch_ekm.typing import Array
 
-from .adapting import adapting_predictions
 from .fingers import FingerMarkers, identify_markers
-from .learning import learned_predictions
+from .learning import adapting_predictions, learned_predictions
 from .nominal import (
     NOMINALS,
     Samples,

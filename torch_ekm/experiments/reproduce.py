@@ -14,11 +14,10 @@ from .jobs import run_jobs
 from .protocols.generalize import Generalize
 from .protocols.online import Online
 from .protocols.protocol import Protocol
-from .records import TrialRecord
+from .records import TrialRecord, trial_frame
 from .reporting.report import Report
 from .reporting.statistics import DataFrame
 from .reporting.tables import why
-from .reporting.trials import trial_frame
 
 PROTOCOLS: dict[str, type[Protocol]] = {"online": Online, "generalize": Generalize}
 #: Seeds that nobody tuned on, at least twenty for each case.

@@ -28,9 +28,8 @@ def unit_means(trials: DataFrame, column: str) -> Series:
 
 def paired_means(ours: DataFrame, theirs: DataFrame, column: str) -> tuple[Array, Array]:
     """Unit means of two groups of trials, for the units that both have."""
-    a, b = unit_means(ours, column), unit_means(theirs, column)
-    units = a.index.intersection(b.index)
-    return a[units].to_numpy(), b[units].to_numpy()
+    a, b = unit_means(ours, column).align(unit_means(theirs, column), join="inner")
+    return a.to_numpy(), b.to_numpy()
 
 
 @dataclass(frozen=True)
