@@ -26,9 +26,10 @@ from torch_ekm._terminal import print_report, progress
 from torch_ekm.cli._app import parse_seeds
 from torch_ekm.experiments.config import Setting, digest, object_name
 from torch_ekm.experiments.protocols.protocol import Protocol
-from torch_ekm.experiments.records import TrialRecord, select
+from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.reporting.statistics import select
 from torch_ekm.experiments.reporting.tables import pivot
 from torch_ekm.experiments.reproduce import Experiment, run_trials, write_report
 from torch_ekm.simulation import ENGINES

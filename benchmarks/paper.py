@@ -23,10 +23,9 @@ from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.protocols.generalize import TABLE_II, Generalize, paper_table, significance_table
 from torch_ekm.experiments.protocols.online import Online, prediction_curves
 from torch_ekm.experiments.protocols.protocol import Protocol
-from torch_ekm.experiments.records import select
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Report, Table
-from torch_ekm.experiments.reporting.statistics import DataFrame, estimate
+from torch_ekm.experiments.reporting.statistics import DataFrame, estimate, select
 from torch_ekm.experiments.reproduce import Experiment, run_trials
 
 #: The last row of Table II as it is printed: E-KM:KM [%].

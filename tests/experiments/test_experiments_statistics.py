@@ -15,7 +15,7 @@ from experiments_records import frame, not_grasped, turn
 from torch_ekm.exceptions import StateError
 from torch_ekm.experiments.protocols.generalize import significance_table
 from torch_ekm.experiments.protocols.online import Online, learning, prediction_curves
-from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord, select
+from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord
 from torch_ekm.experiments.reporting.report import Column, Table
 from torch_ekm.experiments.reporting.statistics import (
     Estimate,
@@ -25,6 +25,7 @@ from torch_ekm.experiments.reporting.statistics import (
     learning_curve,
     paired_means,
     rate,
+    select,
     unit_means,
 )
 from torch_ekm.experiments.reporting.tables import (

@@ -1,10 +1,10 @@
-"""Records of trials: typed figures, kept as JSON, and all trials as one frame, a row each."""
+"""Records of trials: typed figures, kept as JSON."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Self
@@ -12,17 +12,16 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from .._extras import require
 from ..control import Manipulation, StoppingRule, StopReason
 from ..exceptions import StateError
 from ..kinematics import GraspState
 from ..plant import Observation
 from ..typing import Float, Tensor
-from .reporting.statistics import DataFrame
 
 _DEG = np.pi / 180
 _DISLOCATED = math.degrees(StoppingRule().off_limit)
-_PREDICTIONS = ("prediction_km", "prediction_ekm", "true_prediction_km", "true_prediction_ekm")
+
+
 #: Why a trial ended in which no pinch held the object: nothing was measured.
 NOT_GRASPED = "not grasped"
 
@@ -167,47 +166,3 @@ def true_state(seen: Observation) -> GraspState:
     """Joint angles and pose as they are; for reports only."""
     assert seen.truth is not None  # of a simulated hand
     return seen.truth.state
-
-
-def trial_frame(results: Mapping[str, Iterable[TrialRecord]]) -> DataFrame:
-    """The trials of all jobs, one row each.
-
-    Columns are the figures of the record and
-
-    ======================  ===============================================================================
-    job, grasped            of which job; whether a pinch held the object
-    lost, not_reached       as in :class:`TrialRecord`
-    error_deg               steady-state error: true error at the end; of a lost object the whole angle
-    motions                 their number
-    prediction_km, ...      mean over the motions of ``prediction_km_deg``, ...; NaN where there is none
-    ======================  ===============================================================================
-
-    Args:
-        results: job -> its records.
-    """
-    rows = [
-        {"job": job, **vars(one), **_added(one), **one.more}
-        for job, records in results.items()
-        for one in records
-    ]
-    return require("pandas").DataFrame(rows).drop(columns="more")
-
-
-def select(trials: DataFrame, **wanted: Any) -> DataFrame:
-    """Trials of grasped objects with these entries."""
-    chosen = trials["grasped"].astype(bool)
-    for column, value in wanted.items():
-        chosen &= trials[column] == value
-    return trials[chosen]
-
-
-def _added(record: TrialRecord) -> dict[str, Any]:
-    made = {name: getattr(record, f"{name}_deg") for name in _PREDICTIONS}
-    return {
-        "grasped": record.grasped,
-        "lost": record.lost,
-        "not_reached": record.not_reached,
-        "error_deg": abs(record.angle_deg) if record.lost else record.true_error_deg,
-        "motions": record.steps if record.grasped else math.nan,
-        **{name: float(np.mean(errors)) if errors else math.nan for name, errors in made.items()},
-    }

@@ -14,9 +14,9 @@ from .jobs import run_jobs
 from .protocols.generalize import Generalize
 from .protocols.online import Online
 from .protocols.protocol import Protocol
-from .records import TrialRecord, trial_frame
+from .records import TrialRecord
 from .reporting.report import Report
-from .reporting.statistics import DataFrame
+from .reporting.statistics import DataFrame, trial_frame
 from .reporting.tables import why
 
 PROTOCOLS: dict[str, type[Protocol]] = {"online": Online, "generalize": Generalize}

@@ -79,13 +79,11 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
     if len(names) > _MOST_COLUMNS:
         raise DescriptionError(path, f"{len(names)} columns; at most {_MOST_COLUMNS} are read")
     names = names[1:] if names[:1] == ("",) else names
-    known: set[str] = set()
     for i, name in enumerate(names):
         if not name:
             raise DescriptionError(path, f"column {i + 1} has no name in the header")
-        if name in known:
+        if name in names[:i]:
             raise DescriptionError(path, f"two columns are called '{name}'")
-        known.add(name)
     return names, partial(_file_rows, names, read)
 
 
@@ -163,14 +161,13 @@ def _bag_rows(path: Path, bag: interop.BagTable, wanted: Sequence[str]) -> Rows:
     values, n = bag.values[:, at], len(bag.time)
     missing = ~np.isfinite(values)
     kept = np.flatnonzero(~missing.any(axis=1))
-    why: dict[str, list[str]] = {}  # columns of one topic mostly miss alike
+    why: dict[tuple[str, str], list[str]] = {}  # columns of one topic mostly miss alike
     for name, gone in dict(zip(wanted, missing.T, strict=True)).items():
         if gone.any():
-            why.setdefault(f"{name.partition('.')[0]}*{_gaps(gone, bag.time)}", []).append(name)
+            why.setdefault((name.partition(".")[0], _gaps(gone, bag.time)), []).append(name)
     because = [
-        (names[0] if len(names) == 1 else f"{text.partition('*')[0]} ({len(names)} columns, {names[0]})")
-        + text.partition("*")[2]
-        for text, names in why.items()
+        (names[0] if len(names) == 1 else f"{topic} ({len(names)} columns, {names[0]})") + gaps
+        for (topic, gaps), names in why.items()
     ]
     left = f"{len(kept)} of {n} rows, because {', '.join(because)}"
     if not len(kept):

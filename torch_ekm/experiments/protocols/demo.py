@@ -15,10 +15,10 @@ from ...description import load_hand, load_object
 from ...exceptions import EKMError
 from ...rendering import Captions, make_scene, save_animation, save_picture
 from ..config import digest
-from ..records import TrialRecord, select
+from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
 from ..reporting.report import FigureFile, Report, Table
-from ..reporting.statistics import DataFrame
+from ..reporting.statistics import DataFrame, select
 from ..reporting.tables import error_table, pivot
 from ..runner import Bench, new_objects
 from .generalize import Generalize

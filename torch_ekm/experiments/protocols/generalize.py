@@ -13,12 +13,12 @@ import numpy as np
 from ...description import load_object
 from ...exceptions import ParameterError
 from ..config import CONTROLLERS, Setting, digest, object_name
-from ..records import TrialRecord, select
+from ..records import TrialRecord
 from ..reporting import statistics as stats
 from ..reporting import tables
 from ..reporting.plots import plot_steady_state_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import DataFrame
+from ..reporting.statistics import DataFrame, select
 from ..runner import FIRST_GRASP, Bench
 from .protocol import Protocol
 

@@ -10,10 +10,9 @@ from ..._extras import require
 from ...control import StopReason
 from ...typing import Array
 from ..config import CONTROLLERS, FIRST_REPORTED
-from ..records import select
 from . import statistics as stats
 from .report import Cell, Column, Table
-from .statistics import LEAST_SEEDS, DataFrame, Estimate
+from .statistics import LEAST_SEEDS, DataFrame, Estimate, select
 
 _REACHED = StopReason.REACHED.value
 #: What each controller is, in a line.
