@@ -82,13 +82,13 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     """
     first, several, end = text.partition(":")
     try:
-        seeds = range(int(first), int(end) if several else int(first) + 1)
+        start, stop = int(first), int(end) if several else int(first) + 1
     except ValueError:
-        seeds = range(0)
-    if len(seeds) > _MOST_SEEDS:
-        raise ParameterError("seeds", text, f"at most {_MOST_SEEDS} seeds")
-    if seeds and seeds.start >= 0 and seeds.stop <= _LARGEST_SEED:
-        return tuple(seeds)
+        start = stop = 0
+    if 0 <= start < stop <= _LARGEST_SEED:
+        if stop - start > _MOST_SEEDS:
+            raise ParameterError("seeds", text, f"at most {_MOST_SEEDS} seeds")
+        return tuple(range(start, stop))
     valid = f"FIRST:END with 0 <= FIRST < END <= {_LARGEST_SEED}, e.g. 1000:1006, or one number below that"
     raise ParameterError("seeds", text, valid)
 
