@@ -9,7 +9,6 @@ kills after which the motors stood within 100 ms.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import random
@@ -40,6 +39,7 @@ from torch_ekm.drivers import Channel, HandDriver, WithPose, dynamixel_port, yar
 from torch_ekm.drivers import driver as driving
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import DeviceError
+from torch_ekm.experiments.jobs import run_jobs
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantWrapper
 from torch_ekm.plant import Path as Waypoints
@@ -271,12 +271,8 @@ def wrong_wirings() -> tuple[int, int]:
 
 def kept(out: Path, folder: Path, bus: Bus, measure: Callable[..., Any], n: int) -> Any:
     """What ``measure(bus, folder, n)`` gives, from ``out`` if it is there."""
-    path = out / f"{bus.kind}_{measure.__name__}_{n}.json"
-    if not path.exists():
-        found = measure(bus, folder, n)
-        out.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(found), encoding="utf-8")
-    found = json.loads(path.read_text(encoding="utf-8"))
+    name = f"{bus.kind}_{measure.__name__}_{n}"
+    found = run_jobs(measure, {name: (bus, folder, n)}, out)[name]
     tell(f"{bus.kind} {measure.__name__}: {found}")
     return found
 

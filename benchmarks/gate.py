@@ -281,24 +281,22 @@ def session(held, seed: int, readings: int, learns: bool, count: Count, refused:
     count.readings += passed
 
 
-def part(seed: int, readings: int, grips: tuple[tuple[str, str], ...]) -> Count:
+def part(seed: int, readings: int) -> Count:
     """One session, in a process of its own."""
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     count = Count()
     with refusals() as refused:
-        held = grasp(*grips[seed // 2 % len(grips)])
+        held = grasp(*GRASPS[seed // 2 % len(GRASPS)])
         session(held, seed, readings, seed % 2 == 0, count, refused)
     return count
 
 
-def search(
-    readings: int, each: int = 500, seed: int = 0, grips: tuple[tuple[str, str], ...] = GRASPS
-) -> Count:
+def search(readings: int, each: int = 500, seed: int = 0) -> Count:
     """Sessions of ``each`` readings until there were so many; E-KM and KM+S in turn."""
     seeds, count = range(seed, seed + -(-readings // each)), Count()
     with concurrent.futures.ProcessPoolExecutor(min(os.cpu_count() or 1, len(seeds))) as pool:
-        for one in pool.map(part, seeds, itertools.repeat(each), itertools.repeat(grips)):
+        for one in pool.map(part, seeds, itertools.repeat(each)):
             count = count + one
             print(count, file=sys.stderr, flush=True)
     return count

@@ -29,8 +29,8 @@ from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
+from torch_ekm.experiments.reporting.statistics import select
 from torch_ekm.experiments.reporting.tables import pivot
-from torch_ekm.experiments.reporting.trials import select
 from torch_ekm.experiments.reproduce import Experiment, run_trials, write_report
 from torch_ekm.simulation import ENGINES
 

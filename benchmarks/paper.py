@@ -25,8 +25,7 @@ from torch_ekm.experiments.protocols.online import Online, prediction_curves
 from torch_ekm.experiments.protocols.protocol import Protocol
 from torch_ekm.experiments.reporting.plots import COLOURS, new_figure, save_figure
 from torch_ekm.experiments.reporting.report import Cell, Report, Table
-from torch_ekm.experiments.reporting.statistics import DataFrame, estimate
-from torch_ekm.experiments.reporting.trials import select
+from torch_ekm.experiments.reporting.statistics import DataFrame, estimate, select
 from torch_ekm.experiments.reproduce import Experiment, run_trials
 
 #: The last row of Table II as it is printed: E-KM:KM [%].

@@ -17,13 +17,12 @@ from torch_ekm.control import Direction, FocusedPose, Manipulation, PoseTarget, 
 from torch_ekm.exceptions import EKMError, GraspError
 from torch_ekm.experiments.protocols.generalize import Generalize
 from torch_ekm.experiments.records import NOT_GRASPED, Trial, TrialRecord, true_state
-from torch_ekm.experiments.runner import Bench
+from torch_ekm.experiments.runner import FIRST_GRASP, Bench
 from torch_ekm.kinematics import GraspState
 from torch_ekm.typing import Tensor
 
 _DEG = math.pi / 180
 _SI = {"deg": _DEG, "mm": 1e-3}
-_FIRST_GRASP = 1000  # its number, of the turns in which a hand is learned: never one that is tested
 _FAR, _BLIND = 3000, 4000  # numbers of the grasps of the turns that go as far as they can, and blind
 _LEAST_ASKED = 0.01 * _DEG  # of a motor that is to move
 _MADE = 0.8  # of a movement: one that was ended on its way says nothing of the band at its end
@@ -55,7 +54,7 @@ def turns(
     angles = Generalize().angles_of(item) if angles is None else angles
     first = [float(np.median(angles))] * learns_by if isinstance(learns_by, int) else learns_by
     first = first if bench.learns or all_learn else ()
-    asked = [(_FIRST_GRASP + k, angle, "learning" if k else "first") for k, angle in enumerate(first)]
+    asked = [(FIRST_GRASP + k, angle, "learning" if k else "first") for k, angle in enumerate(first)]
     made = []
     for trial, angle, kind in [*asked, *((k, angle, "turn") for k, angle in enumerate(angles))]:
         record = bench.trial(seed, trial, angle, kind)
@@ -103,7 +102,7 @@ def _readings(done: Manipulation) -> dict[str, float]:
 def _warmed(make: Make, item: str, seed: int, angles: Sequence[float]) -> Bench:
     bench = make(item)
     for k, angle in enumerate(angles if bench.learns else ()):
-        bench.trial(seed, _FIRST_GRASP + k, angle, "learning")
+        bench.trial(seed, FIRST_GRASP + k, angle, "learning")
     return bench
 
 

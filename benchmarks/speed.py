@@ -231,10 +231,7 @@ def main(arguments: list[str] | None = None) -> None:
     speed = measure(options.quick)
     if options.out is not None:
         speed.report(options.out)
-    table = speed.table()
-    for row in (table.header, ["---"] * len(table.header), *table.text()):
-        print("| " + " | ".join(row) + " |")
-    print()
+    print(Report("", "", [speed.table()]).markdown(level=0))
     print(speed.verdict)
 
 

@@ -30,18 +30,18 @@ class Recorded:
 
     def __new__(cls, *args: Any, **options: Any):
         made = super().__new__(cls)
+        signature = inspect.signature(cls.__init__)
         try:
-            bound = inspect.signature(cls.__init__).bind(made, *args, **options)
+            bound = signature.bind(made, *args, **options)
         except TypeError:  # copies get their attributes afterwards; a wrong call fails in the constructor
             return made
         bound.apply_defaults()
-        given = list(bound.arguments.items())[1:]
-        kinds = inspect.signature(cls.__init__).parameters
         arguments: dict[str, Any] = {}
-        for name, value in given:
-            if kinds[name].kind is inspect.Parameter.VAR_POSITIONAL and not value:
+        for name, value in list(bound.arguments.items())[1:]:
+            kind = signature.parameters[name].kind
+            if kind is inspect.Parameter.VAR_POSITIONAL and not value:
                 continue  # of a constructor that is nn.Module's own
-            if kinds[name].kind is inspect.Parameter.VAR_KEYWORD:
+            if kind is inspect.Parameter.VAR_KEYWORD:
                 arguments |= {key: plain(one) for key, one in value.items()}
             else:
                 arguments[name] = plain(value)
@@ -253,12 +253,9 @@ def covariance_problems(name: str, P: torch.Tensor, largest: torch.Tensor | None
 
 def bound_problems(state: Mapping[str, Any], **bounds: tuple[float, float]) -> list[str]:
     """Entries of a state that leave the range which their estimator keeps to: ``name=(least, largest)``."""
-    return [
-        f"{name} is not within {least:.6g} and {largest:.6g}"
-        for name, (least, largest) in bounds.items()
-        if not bool(
-            (
-                (state[name] >= least - 1e-9 * abs(least)) & (state[name] <= largest + 1e-9 * abs(largest))
-            ).all()
-        )
-    ]
+    found = []
+    for name, (least, largest) in bounds.items():
+        value, lower, upper = state[name], least - 1e-9 * abs(least), largest + 1e-9 * abs(largest)
+        if not bool(((value >= lower) & (value <= upper)).all()):
+            found.append(f"{name} is not within {least:.6g} and {largest:.6g}")
+    return found

@@ -6,15 +6,11 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .experiments.learner_comparison.plots import plot_learning_curves as plot_learning_curves
-from .experiments.learner_comparison.plots import plot_scores as plot_scores
-from .experiments.learner_comparison.recordings import load_recording as load_recording
-from .experiments.learner_comparison.report import curve_learners as curve_learners
-from .experiments.learner_comparison.report import overview_table as overview_table
-from .experiments.learner_comparison.report import score_table as score_table
-from .experiments.learner_comparison.stream import Stream as Stream
-from .experiments.learner_comparison.stream import load_table as load_table
-from .experiments.reporting.report import Table as Table
+from .experiments.learner_comparison.plots import plot_learning_curves, plot_scores
+from .experiments.learner_comparison.recordings import load_recording
+from .experiments.learner_comparison.report import curve_learners, overview_table, score_table
+from .experiments.learner_comparison.stream import Stream, load_table
+from .experiments.reporting.report import Table
 from .rendering import Scene, save_picture
 
 if TYPE_CHECKING:

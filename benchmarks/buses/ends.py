@@ -41,6 +41,27 @@ from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import SimulatedHand
 
 
+class Wire:
+    """A cable that can be spoilt and pulled, where nothing is known of what is still under way."""
+
+    silent = False
+
+    def spoil(self, spoiler: Spoiler) -> None:
+        self.spoiler = spoiler
+
+    def catch_up(self) -> None:
+        time.sleep(0.2)
+
+    def pull(self, silent: bool) -> None:
+        if silent:
+            self.silent = True
+        else:
+            self.cut()
+
+    def cut(self) -> None:
+        raise NotImplementedError
+
+
 class Dynamixel:
     """Servos behind a pseudo terminal; the genuine SDK is the client."""
 
@@ -77,7 +98,7 @@ class Dynamixel:
         self.bus.close()
 
 
-class Ros2:
+class Ros2(Wire):
     """A node of genuine rclpy: joint states every ``period`` [s], trajectories of one point, as
     ros2_control's controllers; the pose of an object at (0, 0.1, 0) m."""
 
@@ -85,7 +106,7 @@ class Ros2:
 
     def __init__(self, motors: Any, names: tuple[str, ...], period: float) -> None:
         self.motors, self.names, self.goals, self.period = motors, names, [], period
-        self.spoiler, self.silent, self.fault = Spoiler(0.0, 0), False, ""
+        self.spoiler, self.fault = Spoiler(0.0, 0), ""
         self.plug()
 
     def plug(self) -> None:
@@ -142,17 +163,8 @@ class Ros2:
         with contextlib.suppress(Exception):  # the context was shut down
             self._executor.spin()
 
-    def spoil(self, spoiler: Spoiler) -> None:
-        self.spoiler = spoiler
-
-    def catch_up(self) -> None:
-        time.sleep(0.2)  # of discovery and transport nothing is known
-
-    def pull(self, silent: bool) -> None:
-        if silent:
-            self.silent = True
-        else:
-            self.close()
+    def cut(self) -> None:
+        self.close()
 
     def close(self) -> None:
         if (context := getattr(self, "_context", None)) is not None and context.ok():
@@ -160,12 +172,11 @@ class Ros2:
             self._thread.join(2.0)
 
 
-class Yarp:
+class Yarp(Wire):
     """A genuine name server, and a genuine rpc port; the driver reaches it by a cable that can be spoilt."""
 
     def __init__(self, motors: Any, python: str) -> None:
-        self.motors, self.goals, self.modes = motors, [], {}
-        self._spoiler, self._silent = Spoiler(0.0, 0), False
+        self.motors, self.goals, self.modes, self.spoiler = motors, [], {}, Spoiler(0.0, 0)
         with socket.create_server(("127.0.0.1", 0)) as free:
             self._server = free.getsockname()[1]
         self._folder = tempfile.TemporaryDirectory()
@@ -222,8 +233,8 @@ class Yarp:
     # -- the cable ----------------------------------------------------------------------------------
 
     def plug(self) -> None:
-        self.close_cable()
-        self._silent, self._listening = False, socket.create_server(("127.0.0.1", 0))
+        self.cut()
+        self.silent, self._listening = False, socket.create_server(("127.0.0.1", 0))
         port = self._listening.getsockname()[1]
         self._ask(f"unregister {PORT_NAME}/rpc:i")
         self._ask(f"register {PORT_NAME}/rpc:i tcp 127.0.0.1 {port}")
@@ -246,33 +257,21 @@ class Yarp:
                     data = one.recv(4096)
                     if not data:
                         raise ConnectionError
-                    if self._silent:
+                    if self.silent:
                         continue
                     if one is near:
                         far.sendall(data)
                     else:
-                        near.sendall(data if b"Welcome" in data else self._spoiler(data))
+                        near.sendall(data if b"Welcome" in data else self.spoiler(data))
         for one in (near, far):
             one.close()
 
-    def close_cable(self) -> None:
+    def cut(self) -> None:
         if (listening := getattr(self, "_listening", None)) is not None:
             for one in (listening, *self._open):
                 with contextlib.suppress(OSError):
                     one.shutdown(socket.SHUT_RDWR)
                 one.close()
-
-    def spoil(self, spoiler: Spoiler) -> None:
-        self._spoiler = spoiler
-
-    def catch_up(self) -> None:
-        time.sleep(0.2)  # the board answers when it has obeyed; the cable may still hold something
-
-    def pull(self, silent: bool) -> None:
-        if silent:
-            self._silent = True
-        else:
-            self.close_cable()
 
     def close(self) -> None:
         for one in self._processes:

@@ -80,8 +80,12 @@ def samples(learner: Any, m: int) -> Timed:
     return Timed(lambda x, y: (learner.update(x, y), learner.predict(x + 0.1)), *stream(64, m))
 
 
+def pointer(a: np.ndarray) -> ctypes.c_void_p:
+    return a.ctypes.data_as(ctypes.c_void_p)  # keeps the array
+
+
 class PlainC:
-    """The textbook recursion in C."""
+    """The textbook recursion in C, whose samples are pointers to rows."""
 
     def __init__(self, capacity: int, m: int) -> None:
         compiler = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
@@ -106,46 +110,26 @@ class PlainC:
         self.C[:], self.Q[:] = p.covariance.numpy(), p.moments[1].numpy()
         self.gp = gp
         self.mean, self.jac, self.slope = np.zeros(m), np.zeros((m, D)), np.zeros(D)
+        # made once, since ctypes costs more than the work
+        self._state = [pointer(a) for a in (self.X, self.C, self.Q, self.alpha)]
+        self._w, self._work = pointer(self.w), pointer(self.work)
+        self._out = [pointer(a) for a in (self.mean, self.jac, self.slope)]
 
-    @staticmethod
-    def _p(a: np.ndarray):
-        return a.ctypes.data_as(ctypes.c_void_p)
-
-    def update(self, x: np.ndarray, y: np.ndarray) -> None:
-        p = self._p
+    def update(self, x: ctypes.c_void_p, y: ctypes.c_void_p) -> None:
         self.free = self.lib.update(
-            self.n, D, self.m, p(self.X), p(self.C), p(self.Q), p(self.alpha), self.free,
-            p(x), p(y), p(self.w), self.noise, p(self.work),
-        )  # fmt: skip
+            self.n, D, self.m, *self._state, self.free, x, y, self._w, self.noise, self._work
+        )
 
-    def predict(self, x: np.ndarray) -> float:
-        p = self._p
-        return self.lib.predict(
-            self.n, D, self.m, p(self.X), p(self.C), p(self.alpha), self.free, p(x), p(self.w),
-            p(self.mean), p(self.jac), p(self.slope), p(self.work),
-        )  # fmt: skip
+    def predict(self, x: ctypes.c_void_p) -> float:
+        X, C, _, alpha = self._state
+        return self.lib.predict(self.n, D, self.m, X, C, alpha, self.free, x, self._w, *self._out, self._work)
 
     def microseconds(self, which: str, repeats: int = 300) -> float:
-        """Time inside C: the pointers are made once, since ctypes costs more than the work."""
-        x, y = (np.ascontiguousarray(a.numpy()) for a in stream(1, self.m))
-        p, best = self._p, float("inf")
-        state = [p(a) for a in (self.X, self.C, self.Q, self.alpha)]
-        px, py, pw, work = p(x[0]), p(y[0]), p(self.w), p(self.work)
-        out = [p(self.mean), p(self.jac), p(self.slope)]
-        for _ in range(5):
-            begin = time.perf_counter()
-            if which == "update":
-                for _ in range(repeats):
-                    self.free = self.lib.update(
-                        self.n, D, self.m, *state, self.free, px, py, pw, self.noise, work
-                    )
-            else:
-                for _ in range(repeats):
-                    self.lib.predict(
-                        self.n, D, self.m, state[0], state[1], state[3], self.free, px, pw, *out, work
-                    )
-            best = min(best, (time.perf_counter() - begin) / repeats * 1e6)
-        return best
+        """Of a call, the fastest of five series."""
+        x, y = (pointer(a.numpy()[0]) for a in stream(1, self.m))
+        call, given = (self.update, (x, y)) if which == "update" else (self.predict, (x,))
+        series = (timed(lambda: [call(*given) for _ in range(repeats)]) for _ in range(5))
+        return min(series) / repeats * 1e6
 
 
 def gpytorch_fantasy(capacity: int, m: int) -> Callable:

@@ -26,14 +26,14 @@ class Samples(NamedTuple):
     clean: Tensor
 
 
-def smooth(n: int, seed: int, noise: float = 0.1) -> Samples:
+def smooth(n: int, seed: int) -> Samples:
     """Two sines of random directions in four inputs."""
     g = torch.Generator().manual_seed(seed)
     w = torch.randn(4, 2, generator=g, dtype=torch.float64)
     x = torch.randn(n, 4, generator=g, dtype=torch.float64)
     f = torch.sin(x @ w)
     f = f / f.std(0)
-    return Samples(x, f + noise * torch.randn(n, 2, generator=g, dtype=torch.float64), f)
+    return Samples(x, f + 0.1 * torch.randn(n, 2, generator=g, dtype=torch.float64), f)
 
 
 def friedman(n: int, seed: int) -> Samples:
@@ -106,7 +106,7 @@ def from_rest(n: int, seed: int, rest: int = 300) -> Samples:
     return Samples(1e-3 * x, 1e-4 * y, 1e-4 * y)
 
 
-def arm(n: int, seed: int, rate: float = 100.0) -> Samples:
+def arm(n: int, seed: int) -> Samples:
     """Torques of a two-link arm at 100 Hz that a model with other masses and no friction leaves over.
 
     x holds joint angles and speeds [rad, rad/s]; accelerations are not given. Masses 1.2 and 0.9 kg, in the
@@ -117,7 +117,7 @@ def arm(n: int, seed: int, rate: float = 100.0) -> Samples:
     def draw(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(4, 1, 2, generator=g, dtype=torch.float64)
 
-    t = torch.arange(n, dtype=torch.float64).unsqueeze(-1) / rate
+    t = torch.arange(n, dtype=torch.float64).unsqueeze(-1) / 100.0
     size, omega, phase = draw(0.1, 0.5), 2 * math.pi * draw(0.05, 0.65), draw(0.0, 6.28)
     q = (size * torch.sin(omega * t + phase)).sum(0)
     v = (size * omega * torch.cos(omega * t + phase)).sum(0)

@@ -17,7 +17,7 @@ _RATE = 0.01  # of Adam
 
 
 class GPyTorchSVGP(SingleLearner):
-    """GPyTorch's variational GP on inducing points, an Adam step on each sample and a replay.
+    """GPyTorch's variational GP on inducing points, an Adam step on each sample.
 
     Independent outputs share inducing points that start as the first distinct samples. The bound's data
     term is scaled to the number of samples seen. GPyTorch's state lies partly outside of state dicts: the
@@ -25,24 +25,12 @@ class GPyTorchSVGP(SingleLearner):
 
     Args:
         inducing: number of inducing points.
-        minibatch, memory: samples of a step, and those kept to draw them from.
         options: see ResidualLearner (``batch_shape`` must be ()).
     """
 
-    def __init__(
-        self,
-        in_features: int,
-        out_features: int,
-        *,
-        inducing: int = 100,
-        minibatch: int = 1,
-        memory: int = 1,
-        **options: Any,
-    ) -> None:
+    def __init__(self, in_features: int, out_features: int, *, inducing: int = 100, **options: Any) -> None:
         super().__init__(in_features, out_features, **options)
-        self.inducing, self.minibatch, self.memory = inducing, minibatch, memory
-        self.inputs = nn.Buffer(self._like.new_zeros(self.memory, self.in_features))
-        self.targets = nn.Buffer(self._like.new_zeros(self.memory, self.out_features))
+        self.inducing = inducing
         self.reset()
 
     def _build(self) -> tuple[Any, ...]:
@@ -75,17 +63,12 @@ class GPyTorchSVGP(SingleLearner):
 
     def _learn(self, x: Tensor, y: Tensor) -> None:
         model, likelihood, optimizer = self._peer
-        place = self._count % len(self.inputs)
-        self.inputs[place], self.targets[place] = x, y
         self._count += 1
         objective = gpytorch.mlls.VariationalELBO(likelihood, model, num_data=self._count)
-        generator = torch.Generator().manual_seed(self._count - 1)
         model.train()
-        index = torch.randint(min(self._count, self.memory), (self.minibatch,), generator=generator)
-        index[0] = place
         with torch.enable_grad():
             optimizer.zero_grad()
-            loss = -objective(model(self.inputs[index]), self.targets[index])
+            loss = -objective(model(x[None]), y[None])
             loss.backward()
         optimizer.step()
         model.eval()

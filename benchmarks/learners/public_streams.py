@@ -51,51 +51,40 @@ OURS = {"default": partial(default_learner, output_offset="learned"), "SOGP, ada
 
 
 @dataclass(frozen=True)
-class Published:
-    """A figure of others, and where it stands."""
+class Row:
+    """What was measured here, or published; ``width``: mean of the 95 % intervals' over the range of y."""
 
     stream: str
     method: str
     rmse: float | None
-    source: str
+    source: str = "here"
     coverage: float | None = None
     width: float | None = None
+    samples: int = 0
+    mae: float | None = None
+    milliseconds: float | None = None
 
 
 _TRACK = "river, docs/benchmarks/Regression/index.md"
 _REGRESSION, _INTERVALS = "CapyMOA, tutorial on regression", "CapyMOA, tutorial on prediction intervals"
 PUBLISHED = (
-    Published("TrumpApproval", "Aggregated Mondrian forest (best)", 0.349421, _TRACK),
-    Published("TrumpApproval", "k nearest neighbours", 1.59417, _TRACK),
-    Published("ChickWeights", "Bagging of adaptive Hoeffding trees (best)", 36.6311, _TRACK),
-    Published("ChickWeights", "Aggregated Mondrian forest", 41.7123, _TRACK),
-    Published("Fried, first 1000", "kNN (best)", 3.03, _REGRESSION),
-    Published("Fried, first 1000", "SGBR", 3.09, _REGRESSION),
-    Published("Fried, first 1000", "SOKNL", 3.35, _REGRESSION),
-    Published("Fried", "kNN (best)", 2.72, _REGRESSION),
-    Published("Fried", "ARF", 3.31, _REGRESSION),
-    Published("Fried", "AdaPI", None, _INTERVALS, 0.963, 0.274),
-    Published("Fried", "MVE", None, _INTERVALS, 0.974, 0.296),
+    Row("TrumpApproval", "Aggregated Mondrian forest (best)", 0.349421, _TRACK),
+    Row("TrumpApproval", "k nearest neighbours", 1.59417, _TRACK),
+    Row("ChickWeights", "Bagging of adaptive Hoeffding trees (best)", 36.6311, _TRACK),
+    Row("ChickWeights", "Aggregated Mondrian forest", 41.7123, _TRACK),
+    Row("Fried, first 1000", "kNN (best)", 3.03, _REGRESSION),
+    Row("Fried, first 1000", "SGBR", 3.09, _REGRESSION),
+    Row("Fried, first 1000", "SOKNL", 3.35, _REGRESSION),
+    Row("Fried", "kNN (best)", 2.72, _REGRESSION),
+    Row("Fried", "ARF", 3.31, _REGRESSION),
+    Row("Fried", "AdaPI", None, _INTERVALS, 0.963, 0.274),
+    Row("Fried", "MVE", None, _INTERVALS, 0.974, 0.296),
 )
 _COLUMNS = (
     "method", Column("MAE", ".4g"), Column("RMSE", ".4g"), Column("95 %: share [%]", ".1f", percent=True),
     Column("width [%]", ".1f", percent=True), Column("time [ms]"), "source",
 )  # fmt: skip
 STREAMS = ("TrumpApproval", "ChickWeights", "Fried, first 1000", "Fried")
-
-
-@dataclass(frozen=True)
-class Row:
-    """What was measured here; ``width`` is the mean width of 95 % intervals over the range of y."""
-
-    stream: str
-    method: str
-    samples: int
-    mae: float
-    rmse: float
-    milliseconds: float
-    coverage: float | None = None
-    width: float | None = None
 
 
 def track(name: str, method: str, model: Any, limit: int | None) -> Row:
@@ -108,7 +97,7 @@ def track(name: str, method: str, model: Any, limit: int | None) -> Row:
     scores: Any = evaluate.progressive_val_score(data, model, metrics.MAE() + metrics.RMSE())
     milliseconds = 1e3 * (time.perf_counter() - begin) / len(data)
     mae, rmse = (score.get() for score in scores)
-    return Row(name, method, len(data), mae, rmse, milliseconds)
+    return Row(name, method, rmse, samples=len(data), mae=mae, milliseconds=milliseconds)
 
 
 def river_peers() -> dict[str, Callable[[], Any]]:
@@ -138,8 +127,8 @@ def fried(method: str, factory: Callable, x: Array, y: Array) -> Iterator[Row]:
             error, milliseconds = y[: t + 1] - mean, 1e3 * (time.perf_counter() - begin) / (t + 1)
             held, width = (low <= y[: t + 1]) & (y[: t + 1] <= high), (high - low).mean() / np.ptp(y[: t + 1])
             name = "Fried, first 1000" if t + 1 == 1000 else "Fried"
-            rms = math.sqrt(np.square(error).mean())
-            yield Row(name, method, t + 1, np.abs(error).mean(), rms, milliseconds, held.mean(), width)
+            rms, mae = math.sqrt(np.square(error).mean()), np.abs(error).mean()
+            yield Row(name, method, rms, "here", held.mean(), width, t + 1, mae, milliseconds)
 
 
 def capymoa_peers(x: Array, y: Array) -> Iterator[Row]:
@@ -158,9 +147,10 @@ def capymoa_peers(x: Array, y: Array) -> Iterator[Row]:
             method, interval = f"CapyMOA {kind.__name__}, again", kind in (AdaPI, MVE)
             if interval:
                 share, width = result.coverage() / 100, result.nmpiw() / 100
-                yield Row(name, method, n, math.nan, math.nan, milliseconds, share, width)
+                yield Row(name, method, None, "here", share, width, n, None, milliseconds)
             else:
-                yield Row(name, method, n, result.mae(), result.rmse(), milliseconds)
+                rmse, mae = result.rmse(), result.mae()
+                yield Row(name, method, rmse, samples=n, mae=mae, milliseconds=milliseconds)
 
 
 def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
@@ -188,13 +178,10 @@ def tables(rows: list[Row]) -> list[Table]:
     for stream in STREAMS:
         mine = [row for row in rows if row.stream == stream]
         cells: list[list[Cell]] = []
-        for row in mine:
+        for row in (*mine, *(one for one in PUBLISHED if one.stream == stream)):
             name = f"**{row.method}**" if row.method in OURS else row.method
-            cells.append([name, row.mae, row.rmse, row.coverage, row.width, row.milliseconds, "here"])
-        for one in PUBLISHED:
-            if mine and one.stream == stream:
-                name = f"{one.method}, published"
-                cells.append([name, None, one.rmse, one.coverage, one.width, None, one.source])
+            name += "" if row.source == "here" else ", published"
+            cells.append([name, row.mae, row.rmse, row.coverage, row.width, row.milliseconds, row.source])
         if mine:
             name, caption = stream.replace(",", "").replace(" ", "_"), f"{stream} ({mine[0].samples} samples)"
             found.append(Table(name, caption, _COLUMNS, cells))

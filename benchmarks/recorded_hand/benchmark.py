@@ -18,9 +18,8 @@ from torch_ekm.experiments.learners import LEARNERS
 from torch_ekm.model.calibration import Calibration
 from torch_ekm.typing import Array
 
-from .adapting import adapting_predictions
 from .fingers import FingerMarkers, identify_markers
-from .learning import learned_predictions
+from .learning import adapting_predictions, learned_predictions
 from .nominal import (
     NOMINALS,
     Samples,
@@ -31,7 +30,7 @@ from .nominal import (
     through_play,
 )
 from .recordings import APART, RecordedPath, known_diameter, read_recordings
-from .scores import Row, score
+from .report import Row, score
 from .states import States, estimate_states
 from .synthetic import write_synthetic
 

@@ -35,7 +35,7 @@ class Nominal:
 
     name: str
     kind: str
-    """"none", "constant", "published", "calibrated" or "online" (adapting.py)."""
+    """"none", "constant", "published", "calibrated" or "online" (learning.py)."""
     play: bool = False
     """Whether the motors' motion goes through the play of the drive first."""
 

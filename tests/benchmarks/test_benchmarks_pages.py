@@ -14,7 +14,7 @@ pytest.importorskip("write_pages", reason="the benchmarks are not part of this i
 
 import write_pages
 from dots import dot_chart
-from page import Section, page_text
+from write_pages import Section, page_text
 
 from torch_ekm.experiments.reporting.plots import COLOURS
 from torch_ekm.experiments.reporting.report import Table

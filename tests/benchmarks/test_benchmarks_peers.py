@@ -53,12 +53,13 @@ def test_capymoa_example() -> None:
     assert result.cumulative.rmse() < 45.0
 
 
-def test_gpytorch_learns() -> None:
+def test_gpytorch_learns(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("gpytorch")
-    from gpytorch_svgp import GPyTorchSVGP
+    import gpytorch_svgp
 
+    monkeypatch.setattr(gpytorch_svgp, "_RATE", 0.05)
     x = torch.linspace(-1, 1, 60, dtype=torch.float64).repeat(3)[:, None]
-    learner = GPyTorchSVGP(1, 2, inducing=8, memory=20, minibatch=10)
+    learner = gpytorch_svgp.GPyTorchSVGP(1, 2, inducing=8)
     assert not learner(x).any()
     y = torch.cat([x, -x], dim=1)
     learner.update(x, y)

@@ -61,10 +61,10 @@ def test_plain_c_gives_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(recursion, "pruning_loss", loss_in_the_mean)
     monkeypatch.setattr(gp, "engine", None)  # it asks for the loss by its name
     for x, y in zip(xs, ys, strict=True):
-        reference.update(np.ascontiguousarray(x.numpy()), np.ascontiguousarray(y.numpy()))
+        reference.update(*(bench_learners.pointer(row.contiguous().numpy()) for row in (x, y)))
         gp.update(x, y)
     x = xs[0] + 0.1
-    variance = reference.predict(np.ascontiguousarray(x.numpy()))
+    variance = reference.predict(bench_learners.pointer(x.numpy()))
     ours = gp.predict_with_jacobians(x)
     np.testing.assert_allclose(reference.mean, ours.mean.numpy(), atol=1e-5)
     np.testing.assert_allclose(reference.jac, ours.mean_jacobian.numpy(), atol=1e-5)

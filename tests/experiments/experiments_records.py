@@ -8,7 +8,7 @@ from typing import Any
 import pandas
 
 from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord
-from torch_ekm.experiments.reporting.trials import trial_frame
+from torch_ekm.experiments.reporting.statistics import trial_frame
 
 FIGURES: dict[str, Any] = {
     "object": "box", "kind": "turn", "controller": "KM", "seed": 0, "trial": 1, "angle_deg": 20.0,

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from torch_ekm._terminal import as_printed, print_report, print_table, progress, unbroken
 from torch_ekm.cli import app, main
-from torch_ekm.cli._help import GROUPS
+from torch_ekm.cli._app import GROUPS
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan
 from torch_ekm.plant import Trajectory, TrialLog

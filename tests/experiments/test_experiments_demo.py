@@ -18,7 +18,7 @@ from torch_ekm.experiments.jobs import read_result
 from torch_ekm.experiments.protocols.demo import Demo, new_table
 from torch_ekm.experiments.records import TrialRecord
 from torch_ekm.experiments.reporting.report import Report
-from torch_ekm.experiments.reporting.trials import trial_frame
+from torch_ekm.experiments.reporting.statistics import trial_frame
 from torch_ekm.experiments.reproduce import Experiment, reproduce
 from torch_ekm.experiments.runner import Bench
 from torch_ekm.model import ModelOptions

@@ -25,6 +25,7 @@ from torch_ekm.experiments.reporting.statistics import (
     learning_curve,
     paired_means,
     rate,
+    select,
     unit_means,
 )
 from torch_ekm.experiments.reporting.tables import (
@@ -34,7 +35,6 @@ from torch_ekm.experiments.reporting.tables import (
     reason_table,
     verdict,
 )
-from torch_ekm.experiments.reporting.trials import select
 
 # -- records -----------------------------------------------------------------------------------------
 

@@ -9,7 +9,6 @@ from .._terminal import say_error, say_note  # first: needs the extra
 from ..exceptions import EKMError, MissingExtraError
 from . import describe as describe
 from . import experiments as experiments
-from . import logs as logs
 from . import real_hand as real_hand
 from ._app import app
 

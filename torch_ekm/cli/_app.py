@@ -3,19 +3,47 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
-from .._terminal import say  # first: needs the extra
+from .._terminal import console, say  # first: needs the extra
 from .._text import figure
 from .._versions import versions_of
 from ..exceptions import ParameterError
-from ._help import Commands
 
 import typer  # isort: skip
 from typer import Option  # isort: skip
+from typer.core import TyperGroup  # isort: skip
+
+GROUPS = {
+    "Try it in simulation": ("demo", "reproduce"),
+    "Describe a hand": ("hands", "objects", "check", "show"),
+    "Recordings of any robot": ("compare",),
+    "Logs of a hand": ("replay", "verify", "health"),
+    "A real hand": ("drivers", "slack", "identify-servo", "knowledge"),
+    "The package": ("notebooks", "version"),
+}
+
+
+class _Commands(TyperGroup):
+    """Groups with whole sentences; the first column is as wide as the longest name."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write each group as a section."""
+        width = max(map(len, self.commands))
+        for title, names in GROUPS.items():
+            heading = typer.style(title, bold=True, fg="blue") if console.is_terminal else title
+            with formatter.section(heading):
+                rows = [(name.ljust(width), _sentence(self.commands[name].help or "")) for name in names]
+                formatter.write_dl(rows)
+
+
+def _sentence(text: str) -> str:
+    """The first line of a help text: a sentence."""
+    return " ".join(text.strip().split("\n\n")[0].split())
+
 
 app = typer.Typer(
-    cls=Commands,
+    cls=_Commands,
     help="Kinematic models of underactuated hands, corrected by online learners.",
     context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode=None,  # rich would take "[deg]" for a style and drop it
@@ -52,16 +80,15 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     Raises:
         ParameterError: it is neither, a seed is negative or not below 2^31, or there are more than 10,000.
     """
+    first, several, end = text.partition(":")
     try:
-        numbers = [int(part) for part in text.split(":")]
+        start, stop = int(first), int(end) if several else int(first) + 1
     except ValueError:
-        numbers = []
-    if len(numbers) == 1:
-        numbers.append(numbers[0] + 1)
-    if len(numbers) == 2 and 0 <= numbers[0] < numbers[1] <= _LARGEST_SEED:
-        if numbers[1] - numbers[0] <= _MOST_SEEDS:
-            return tuple(range(*numbers))
-        raise ParameterError("seeds", text, f"at most {_MOST_SEEDS} seeds")
+        start = stop = 0
+    if 0 <= start < stop <= _LARGEST_SEED:
+        if stop - start > _MOST_SEEDS:
+            raise ParameterError("seeds", text, f"at most {_MOST_SEEDS} seeds")
+        return tuple(range(start, stop))
     valid = f"FIRST:END with 0 <= FIRST < END <= {_LARGEST_SEED}, e.g. 1000:1006, or one number below that"
     raise ParameterError("seeds", text, valid)
 

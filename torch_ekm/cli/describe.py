@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
+from .._files import make_folder
 from .._terminal import console, print_table, say, say_next
-from ..exceptions import OutputError, ParameterError
+from ..exceptions import DescriptionError, OutputError, ParameterError
 from ._app import AN_OBJECT, app
 
 import typer  # isort: skip
@@ -130,12 +132,40 @@ def notebooks(
     copy: Annotated[Path | None, Option(help="Copy them into this folder.")] = None,
 ) -> None:
     """List the notebooks of the package, or copy them."""
-    from ..experiments.reporting.notebook import copy_notebooks, notebook_folder
-
     found = sorted(notebook_folder().glob("[0-9]*.ipynb"))
     for path in found if copy is None else copy_notebooks(copy):
         say(str(path))
     say_next("torch-ekm notebooks --copy DIR" if copy is None else f"jupyter lab {copy}")
+
+
+def notebook_folder() -> Path:
+    """Find the notebooks: in the installed package, or in the checkout.
+
+    Raises:
+        DescriptionError: in neither.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "_notebooks", package.parent / "notebooks"):
+        if any(folder.glob("[0-9]*.ipynb")):
+            return folder
+    raise DescriptionError(package, "the notebooks are missing from this installation; install it again")
+
+
+def copy_notebooks(folder: Path) -> list[Path]:
+    """Copy all notebooks into ``folder`` (made if it is not there) and return the copies' paths.
+
+    Raises:
+        DescriptionError: one of them is there already; nothing is copied.
+    """
+    sources = sorted(notebook_folder().glob("[0-9]*.ipynb"))
+    copies = [folder / source.name for source in sources]
+    present = [copy.name for copy in copies if copy.exists()]
+    if present:
+        raise DescriptionError(folder, f"{', '.join(present)} would be overwritten; name another folder")
+    if folder.exists() and not folder.is_dir():
+        raise DescriptionError(folder, "this is a file; name a folder")
+    make_folder(folder)
+    return [Path(shutil.copyfile(*pair)) for pair in zip(sources, copies, strict=True)]
 
 
 @app.command()

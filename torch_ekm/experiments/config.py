@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from .._checks import check_kind
+from .._checks import check_count, check_kind
 from .._recorded import describe
 from ..control import (
     DEFAULT_LIMITS,
@@ -25,7 +25,7 @@ from ..control import (
 )
 from ..description import list_hands
 from ..description.registry import file_digests
-from ..exceptions import ParameterError, UnknownNameError
+from ..exceptions import UnknownNameError
 from ..model import ModelOptions
 from ..simulation import ENGINES, PlantConfig, PlantParameters, preset
 from .learners import DEFAULT_LEARNER, HAND_LEARNERS, make_learner
@@ -84,8 +84,7 @@ class Setting:
             if getattr(self, name) not in known:
                 raise UnknownNameError(name, getattr(self, name), known)
         for name in ("capacity", "frames"):
-            if not getattr(self, name) > 0:
-                raise ParameterError(name, getattr(self, name), "positive")
+            check_count(name, getattr(self, name))
         kinds = {"plant": PlantParameters, "config": PlantConfig, "model": ModelOptions}
         kinds |= {"limiting": LimitingFunction, "safety": Safety}
         for name, kind in kinds.items():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import torch
@@ -16,41 +17,16 @@ from ..residual import ResidualLearner
 N_OUT = 6
 
 Factory = Callable[..., ResidualLearner]
-
-
 #: Inputs and outputs of the order of 1 are taken as they are.
 _AS_GIVEN: dict[str, Any] = {"noise_variance": NOISE_VARIANCE, "standardize": False}
 _FRESH: dict[str, Any] = {**_AS_GIVEN, "forgetting_factor": 0.99, "robust": 3.0}
 
 
-def _kind(make: Factory, size: str = "", **figures: Any) -> Factory:
-    """A factory ``(in_features, out_features, capacity=100, **options)`` of one kind of learner.
-
-    Args:
-        make: its class, or a function.
-        size: name of its argument for the capacity; "": it has none.
-        figures: its other arguments.
-    """
-
-    def factory(d: int, m: int, *, capacity: int = 100, **options: Any) -> ResidualLearner:
-        return make(d, m, **{**figures, **({size: capacity} if size else {}), **options})
-
-    return factory
-
-
-def _sparse(
-    make: Factory = residual.SparseOnlineGP, of_kernel: str = "kernel", **own: Any
-) -> Callable[..., ResidualLearner]:
+def _sparse(make: Factory = residual.SparseOnlineGP, of_kernel: str = "kernel", **own: Any) -> Factory:
     """A sparse online GP that distrusts and forgets by two figures, and has other parts."""
 
-    def factory(d: int, m: int, *, capacity: int = 100, **options: Any) -> ResidualLearner:
-        given = {
-            **_AS_GIVEN,
-            "capacity": capacity,
-            of_kernel: residual.SquaredExponential(d),
-            **own,
-            **options,
-        }
+    def factory(d: int, m: int, **options: Any) -> ResidualLearner:
+        given = {**_AS_GIVEN, of_kernel: residual.SquaredExponential(d), **own, **options}
         robust, fading = given.pop("robust", None), given.pop("forgetting_factor", 1.0)
         parts = [] if robust is None else [residual.RobustWeight(robust)]
         parts += [] if fading == 1.0 else [residual.ForgettingFactor(fading)]
@@ -69,17 +45,17 @@ _MIXED = (
     _sparse(robust=3.0, parts=[residual.ProcessNoise(0.003), residual.LearnHyperparameters()]),
 )
 
-#: Name -> ``factory(in_features, out_features, capacity=100, **options)``. Inputs and outputs are of the
-#: order of 1; all but the first start from the same generic prior: lengthscale sqrt(d), unit variance, and
-#: about 100 of whatever they keep.
+#: Name -> ``factory(in_features, out_features, **options)``. Inputs and outputs are of the order of 1; all
+#: but the first start from the same generic prior: lengthscale sqrt(d), unit variance, and about 100 of
+#: whatever they keep.
 LEARNERS: dict[str, Factory] = {
-    "default": _kind(residual.default_learner, "capacity"),
-    "model alone": _kind(residual.ZeroResidual),
-    "linear RLS": _kind(residual.RecursiveLeastSquares, **_FRESH),
-    "random features": _kind(residual.RandomFeatureRLS, "n_frequencies", **_FRESH),
-    "MLP": _kind(residual.ReplayMLP, standardize=False),
-    "MLP ensemble": _kind(residual.ReplayMLP, members=3, standardize=False),
-    "SOGP default": _kind(residual.SparseOnlineGP, "capacity"),
+    "default": residual.default_learner,
+    "model alone": residual.ZeroResidual,
+    "linear RLS": partial(residual.RecursiveLeastSquares, **_FRESH),
+    "random features": partial(residual.RandomFeatureRLS, **_FRESH),
+    "MLP": partial(residual.ReplayMLP, standardize=False),
+    "MLP ensemble": partial(residual.ReplayMLP, members=3, standardize=False),
+    "SOGP default": residual.SparseOnlineGP,
     "SOGP plain": _sparse(),  # nothing forgotten, every sample trusted
     "SOGP": _sparse(forgetting_factor=0.99, robust=3.0),
     # no forgetting: what features are learned from is the past
@@ -90,7 +66,7 @@ LEARNERS: dict[str, Factory] = {
         parts=[residual.CalibrateNoise(), residual.DetectChanges()],
     ),
     "SOGP mixture": _mixture,
-    "river forest": _kind(interop.RiverResidual),
+    "river forest": interop.RiverResidual,
 }
 #: The default learner, and the sparse online GP in its forms.
 OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
@@ -98,15 +74,15 @@ OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
 COMPARED = tuple(name for name in LEARNERS if name != "river forest")
 
 
-def learner_factory(name: str) -> Factory:
+def learner_factory(name: str, known: Mapping[str, Factory] = LEARNERS) -> Factory:
     """The factory of that name.
 
     Raises:
         UnknownNameError: no such learner; the message lists them.
     """
-    if name not in LEARNERS:
-        raise UnknownNameError("learner", name, LEARNERS)
-    return LEARNERS[name]
+    if name not in known:
+        raise UnknownNameError("learner", name, known)
+    return known[name]
 
 
 def _action_linear(
@@ -145,6 +121,4 @@ def make_learner(name: str, n_s: int, n_a: int, capacity: int, **options: Any) -
     Raises:
         UnknownNameError: no such learner of a hand; the message lists them.
     """
-    if name not in HAND_LEARNERS:
-        raise UnknownNameError("learner", name, HAND_LEARNERS)
-    return HAND_LEARNERS[name](n_s, n_a, capacity=capacity, **options)
+    return learner_factory(name, HAND_LEARNERS)(n_s, n_a, capacity=capacity, **options)

@@ -16,9 +16,8 @@ from .protocols.online import Online
 from .protocols.protocol import Protocol
 from .records import TrialRecord
 from .reporting.report import Report
-from .reporting.statistics import DataFrame
+from .reporting.statistics import DataFrame, trial_frame
 from .reporting.tables import why
-from .reporting.trials import trial_frame
 
 PROTOCOLS: dict[str, type[Protocol]] = {"online": Online, "generalize": Generalize}
 #: Seeds that nobody tuned on, at least twenty for each case.

@@ -40,7 +40,7 @@ _HOPELESS = 2  # trials without any grasp, after which the object is given up
 _LEARNS_BY = (14.0, -8.0, 22.0)  # [deg] in this order
 _MOTIONS = 30  # at least, unless turns end early
 _MOST_TURNS = 12
-_FIRST_GRASP = 1000  # its number: never one that is tested
+FIRST_GRASP = 1000  # its number: never one that is tested
 
 
 class Bench:
@@ -122,7 +122,7 @@ class Bench:
         records: list[TrialRecord] = []
         while sum(one.steps for one in records) < _MOTIONS and len(records) < _MOST_TURNS:
             k = len(records)
-            records.append(self.trial(seed, _FIRST_GRASP + k, _LEARNS_BY[k % len(_LEARNS_BY)], "first"))
+            records.append(self.trial(seed, FIRST_GRASP + k, _LEARNS_BY[k % len(_LEARNS_BY)], "first"))
         return records
 
     def turn(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from .drawing import Picture
-from .image import save_picture
-from .scene import Scene, make_scene
+from .scene import Scene, make_scene, save_picture
 from .web import Captions, save_animation
 
 __all__ = [

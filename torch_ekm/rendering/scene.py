@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import pickle
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,11 +15,11 @@ import torch
 
 from .._extras import require
 from ..description import HandDescription, ObjectDescription, Shape
-from ..exceptions import DescriptionError
+from ..exceptions import DescriptionError, EKMError
 from ..kinematics import HandKinematics
 from ..kinematics.se3 import log
 from ..typing import Array
-from .drawing import Drawn
+from . import drawing
 from .visuals import Mesh, visuals
 
 Colour = tuple[float, float, float]
@@ -44,7 +49,7 @@ class Scene:
         return 0.35 if shape >= len(self.shapes) - self.ghosts else 1.0
 
     @property
-    def meshes(self) -> list[Drawn]:
+    def meshes(self) -> list[drawing.Drawn]:
         """What :class:`Picture` draws.
 
         Raises:
@@ -62,6 +67,28 @@ class Scene:
         """Position and focus of the camera [m], and up."""
         focus = self.transforms[:, :, :3, 3].reshape(-1, 3).mean(axis=0)
         return focus + _DISTANCE * self.side / np.linalg.norm(self.side), focus, -self.down
+
+
+def save_picture(scene: Scene, path: Path, frames: Sequence[int] = (-1,)) -> Path:
+    """Draw some frames side by side, each 640 pixels wide.
+
+    An OpenGL that is broken can abort the whole process, so PyVista draws in a process of its own.
+
+    Raises:
+        MissingExtraError: pyvista or trimesh is not installed.
+        EKMError: PyVista cannot draw on this machine, or ``path`` cannot be written; the message ends with
+            what it says.
+    """
+    scene = replace(scene, transforms=scene.transforms[list(frames)])
+    given = pickle.dumps((scene.meshes, scene.transforms, scene.camera, path, (640, 480)))
+    # -P: modules beside the file are not imported by their bare names
+    command = [sys.executable, "-P", drawing.__file__]
+    done = subprocess.run(command, input=given, capture_output=True, check=False)
+    if done.returncode != 0 or not path.exists():
+        said = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        remedy = "without a screen and OpenGL it needs VTK 9.5 or newer"
+        raise EKMError(f"PyVista could not draw {path} (exit status {done.returncode}); {remedy}: {said}")
+    return path
 
 
 def make_scene(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import pickle
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,7 +23,7 @@ from ..learners import COMPARED, Factory, learner_factory
 from .prequential import run_prequential
 from .recordings import LIMIT, load_recording
 from .report import ComparisonReport
-from .scores import Score, block_bootstrap, blocks_of, errors_of_outputs
+from .scores import Score, block_bootstrap, blocks_of
 from .stream import LEAST, Stream
 
 
@@ -108,24 +109,33 @@ def compare(
 
 def run_one(stream: Stream, factory: Factory) -> dict[str, Any]:
     """One job: plain figures that JSON can hold."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # small matrices: more threads only wait for each other
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
-            model = factory(stream.x.shape[1], stream.y.shape[1])
-            run = run_prequential(model, stream.x, stream.y, stream.segments)
-    finally:
-        torch.set_num_threads(threads)
+    with repeatable():
+        model = factory(stream.x.shape[1], stream.y.shape[1])
+        run = run_prequential(model, stream.x, stream.y, stream.segments)
     start = stream.warm_up
+    error = run.error[start:]
+    medians = error.abs().quantile(0.5, dim=0)
     return {
-        "squared": [float(f"{value:.6g}") for value in _squared(run.error[start:])],
-        "of_outputs": errors_of_outputs(run.error[start:]),
+        "squared": [float(f"{value:.6g}") for value in _squared(error)],
+        "of_outputs": {"rms": error.square().mean(0).sqrt().tolist(), "median": medians.tolist()},
         "nll": run.nll(start),
         "coverage": float(run.coverage(start).mean()),
         "microseconds": 1e6 * run.seconds / len(stream),
         "kilobytes": _kilobytes(model),
     }
+
+
+@contextmanager
+def repeatable() -> Iterator[None]:
+    """One thread, and random numbers from the seed 0; afterwards both are as they were."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # small matrices: more threads only wait for each other
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _factories(learners: Mapping[str, Factory] | Sequence[str] | None) -> dict[str, Factory]:
@@ -144,8 +154,7 @@ def _made(name: str, factory: Factory, stream: Stream) -> ResidualLearner:
         raise ParameterError(f"learners[{name!r}]", factory, f"a factory, such as {type(factory).__name__}")
     valid = f"a factory (in_features, out_features) -> ResidualLearner; called with ({d}, {m}) it "
     try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)
+        with repeatable():
             learner = factory(d, m)
     except MissingExtraError:
         raise
@@ -163,9 +172,8 @@ def _made(name: str, factory: Factory, stream: Stream) -> ResidualLearner:
 
 def _job_name(stream: Stream, name: str, learner: ResidualLearner) -> str:
     """Named after what decides the result: samples, arguments, and what the learner does at first."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        made_with = describe(learner)
+    made_with = describe(learner)
+    with repeatable():
         first = run_prequential(learner, stream.x[:LEAST], stream.y[:LEAST], stream.segments)
     said = [f"{value:.6g}" for value in torch.cat([first.mean, first.deviation]).flatten().tolist()]
     decides = hashlib.sha256(

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...typing import Array, Float, Tensor
+from ...typing import Array
 from ..reporting.statistics import Estimate, bootstrap
 from .stream import Stream
 
@@ -125,12 +125,6 @@ class Comparison:
         if sure := [score.learner for score in self.row(stream.name) if score.nll > _ABSURD]:
             text += f" Errors far beyond the stated variance (NLL): {', '.join(sure)}."
         return text
-
-
-def errors_of_outputs(error: Float[Tensor, "n m"]) -> dict[Measure, list[float]]:
-    """rms and median of the absolute errors of each output."""
-    medians = error.abs().quantile(0.5, dim=0)
-    return {"rms": error.square().mean(0).sqrt().tolist(), "median": medians.tolist()}
 
 
 def rare_share(squared: Array) -> float:

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ... import interop
+from ..._extras import require
+from ..._files import check_announced, check_file, told_as_damage
 from ...exceptions import DescriptionError, ParameterError, UnknownNameError
 from ...typing import Array
-from .csv_file import Names, Read, open_csv
-from .parquet_file import open_parquet
+from .csv_file import Names, Read, labels, open_csv
 
 _BAGS = (".mcap", ".db3", ".bag")
-_READERS = {
-    ".csv": open_csv, ".tsv": open_csv, ".txt": open_csv, ".parquet": open_parquet, ".pq": open_parquet
-}  # fmt: skip
+_CSV, _PARQUET = (".csv", ".tsv", ".txt"), (".parquet", ".pq")
+_LARGEST_PARQUET = 4 << 30  # bytes
 _MOST_COLUMNS = 4096
 _INDEXED = re.compile(r"(.+)\[([0-9]{1,4})\]")
 _TIME = re.compile(  # also %time of ROS 1, __time of PlotJuggler, header.stamp
@@ -65,7 +65,7 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
         UnknownNameError: the recording has no such topic; the message lists them.
     """
     kind = path.suffix.lower()
-    if kind not in _READERS and (os.path.isdir(path) or kind in _BAGS):
+    if kind not in (*_CSV, *_PARQUET) and (os.path.isdir(path) or kind in _BAGS):
         if clock is None:
             valid = "a topic whose messages set the rows (--clock), such as that of the commands"
             raise ParameterError("clock", clock, valid)
@@ -73,20 +73,64 @@ def open_table(path: Path, clock: str | None = None, label: str = "") -> tuple[N
         return bag.names, partial(_bag_rows, path, bag)
     if not os.path.isfile(path):
         raise DescriptionError(path, "there is no such file")
-    if kind not in _READERS:
+    if kind not in (*_CSV, *_PARQUET):
         raise DescriptionError(path, f"files of kind '{path.suffix}' are not read; use .csv or .parquet")
-    names, read = _READERS[kind](path, label)
+    names, read = (open_csv if kind in _CSV else open_parquet)(path, label)
     if len(names) > _MOST_COLUMNS:
         raise DescriptionError(path, f"{len(names)} columns; at most {_MOST_COLUMNS} are read")
     names = names[1:] if names[:1] == ("",) else names
-    known: set[str] = set()
     for i, name in enumerate(names):
         if not name:
             raise DescriptionError(path, f"column {i + 1} has no name in the header")
-        if name in known:
+        if name in names[:i]:
             raise DescriptionError(path, f"two columns are called '{name}'")
-        known.add(name)
     return names, partial(_file_rows, names, read)
+
+
+def open_parquet(path: Path, label: str) -> tuple[Names, Read]:
+    """Column names, and a function that reads some of them; these hold numbers.
+
+    Checksums of pages are compared where they were written (``write_page_checksum=True`` of pyarrow).
+
+    Raises:
+        DescriptionError: no Parquet file, damaged, or some kB that announce GB. The function raises it, too.
+    """
+    check_file(path, "file of a table", _LARGEST_PARQUET)
+    parquet = require("pyarrow.parquet")
+    with told_as_damage(path, "file, or no Parquet file"), parquet.ParquetFile(path) as file:
+        return tuple(file.schema_arrow.names), partial(_parquet_columns, path, label)
+
+
+def _parquet_columns(path: Path, label: str, columns: Sequence[str]) -> Array:
+    parquet = require("pyarrow.parquet")
+    with (
+        told_as_damage(path, "Parquet file"),
+        parquet.ParquetFile(path, page_checksum_verification=True) as file,
+    ):
+        n = file.metadata.num_rows
+        check_announced(path, 8 * n * (1 + len(columns)), path.stat().st_size)
+        table = file.read(columns=list(columns))
+        values = [_parquet_values(path, name, table.column(name), name == label) for name in columns]
+        if any(len(column) != n for column in values):
+            raise DescriptionError(path, "damaged: it has another number of rows than it says")
+        return np.stack(values, -1) if columns else np.empty((n, 0))
+
+
+def _parquet_values(path: Path, name: str, column: Any, is_label: bool) -> Array:
+    types = require("pyarrow").types
+    kind = column.type
+    if is_label and (types.is_string(kind) or types.is_large_string(kind)):
+        texts = column.to_pylist()
+        number = labels(texts)
+        found = np.array([number(text) if text else None for text in texts], dtype=np.float64)
+    elif types.is_integer(kind) or types.is_floating(kind):
+        found = column.to_numpy().astype(np.float64)
+    else:
+        raise DescriptionError(path, f"column '{name}' holds {kind}, not numbers; leave it out or encode it")
+    if not np.isfinite(found).all():
+        row = int(np.flatnonzero(~np.isfinite(found))[0])
+        raise DescriptionError(path, f"row {row + 1}, column '{name}' is empty or not finite")
+    return found
 
 
 def _file_rows(names: Names, read: Read, wanted: Sequence[str]) -> Rows:
@@ -117,14 +161,13 @@ def _bag_rows(path: Path, bag: interop.BagTable, wanted: Sequence[str]) -> Rows:
     values, n = bag.values[:, at], len(bag.time)
     missing = ~np.isfinite(values)
     kept = np.flatnonzero(~missing.any(axis=1))
-    why: dict[str, list[str]] = {}  # columns of one topic mostly miss alike
+    why: dict[tuple[str, str], list[str]] = {}  # columns of one topic mostly miss alike
     for name, gone in dict(zip(wanted, missing.T, strict=True)).items():
         if gone.any():
-            why.setdefault(f"{name.partition('.')[0]}*{_gaps(gone, bag.time)}", []).append(name)
+            why.setdefault((name.partition(".")[0], _gaps(gone, bag.time)), []).append(name)
     because = [
-        (names[0] if len(names) == 1 else f"{text.partition('*')[0]} ({len(names)} columns, {names[0]})")
-        + text.partition("*")[2]
-        for text, names in why.items()
+        (names[0] if len(names) == 1 else f"{topic} ({len(names)} columns, {names[0]})") + gaps
+        for (topic, gaps), names in why.items()
     ]
     left = f"{len(kept)} of {n} rows, because {', '.join(because)}"
     if not len(kept):

@@ -18,9 +18,8 @@ from ..config import digest
 from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
 from ..reporting.report import FigureFile, Report, Table
-from ..reporting.statistics import DataFrame
+from ..reporting.statistics import DataFrame, select
 from ..reporting.tables import error_table, pivot
-from ..reporting.trials import select
 from ..runner import Bench, new_objects
 from .generalize import Generalize
 

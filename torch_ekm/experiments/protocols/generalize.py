@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Self
 
@@ -19,9 +18,8 @@ from ..reporting import statistics as stats
 from ..reporting import tables
 from ..reporting.plots import plot_steady_state_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import DataFrame
-from ..reporting.trials import select
-from ..runner import Bench
+from ..reporting.statistics import DataFrame, select
+from ..runner import FIRST_GRASP, Bench
 from .protocol import Protocol
 
 #: Rotations of the paper's Table I [deg].
@@ -49,7 +47,6 @@ ENDS: dict[str, float] = {
 SHARES = (0.2, 0.4, 0.6, 0.8, 1.0)
 #: Angles for objects whose end nobody has found [deg].
 OTHER_ANGLES = (5.0, 10.0, 15.0, 20.0, 25.0)
-_FIRST_WARM_UP = 1000  # number of the first training grasp: never one that is tested
 
 
 @dataclass(frozen=True)
@@ -113,12 +110,11 @@ class Generalize(Protocol):
     def session(self, object: str, controller: str, seed: int) -> list[TrialRecord]:
         """Warm-up (E-KM only), then all angles, with one object and one seed."""
         bench = Bench(self.setting.hardware_instance(seed), object, controller)
-        turn = partial(bench.trial, seed)
         angles = self.angles_of(object)
         middle = float(np.median(angles))
-        warm_up = self.warm_up if bench.learns else 0
-        records = [turn(_FIRST_WARM_UP + k, middle, "warm-up") for k in range(warm_up)]
-        records += [turn(trial, angle, poses=self.poses) for trial, angle in enumerate(angles)]
+        before = range(FIRST_GRASP, FIRST_GRASP + self.warm_up * bench.learns)
+        records = [bench.trial(seed, k, middle, "warm-up") for k in before]
+        records += [bench.trial(seed, k, angle, poses=self.poses) for k, angle in enumerate(angles)]
         bench.close()
         return records
 

@@ -17,8 +17,7 @@ from ..records import TrialRecord
 from ..reporting import tables
 from ..reporting.plots import plot_learning_test, plot_prediction_error, save_figure
 from ..reporting.report import Cell, Column, Report, Table
-from ..reporting.statistics import LEAST_SEEDS, DataFrame, bootstrap_mean, learning_curve
-from ..reporting.trials import select
+from ..reporting.statistics import LEAST_SEEDS, DataFrame, bootstrap_mean, learning_curve, select
 from ..runner import Bench
 from .protocol import Protocol
 

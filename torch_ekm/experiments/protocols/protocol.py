@@ -39,7 +39,7 @@ class Protocol(ABC):
         """Summary, tables, and figures in ``folder``.
 
         Args:
-            trials: of all sessions, see :func:`~torch_ekm.experiments.reporting.trials.trial_frame`.
+            trials: of all sessions, see :func:`~torch_ekm.experiments.reporting.statistics.trial_frame`.
         """
 
     def __str__(self) -> str:

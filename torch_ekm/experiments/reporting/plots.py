@@ -103,7 +103,7 @@ def plot_steady_state_error(turns: DataFrame) -> Figure:
     the mean. A few turns at many times the error of all others are crosses at the upper edge.
 
     Args:
-        turns: of :func:`~torch_ekm.experiments.reporting.trials.trial_frame`.
+        turns: of :func:`~torch_ekm.experiments.reporting.statistics.trial_frame`.
     """
     objects, controllers = list(turns.groupby("object", sort=False)), list(turns["controller"].unique())
     columns = min(len(objects), 3)

@@ -1,16 +1,20 @@
-"""From trials to figures that can be claimed; the independent unit is an object and a seed."""
+"""Trials as one frame, and figures that can be claimed; the independent unit is an object and a seed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..._extras import require
 from ...typing import Array
+
+if TYPE_CHECKING:
+    from ..records import TrialRecord
 
 #: A frame of pandas and one of its columns, which is in an extra: its own annotations are too wide to help.
 DataFrame = Any
@@ -19,6 +23,51 @@ Series = Any
 ALPHA = 0.05
 #: With fewer seeds nothing is called better, and no p-value is given.
 LEAST_SEEDS = 10
+_PREDICTIONS = ("prediction_km", "prediction_ekm", "true_prediction_km", "true_prediction_ekm")
+
+
+def trial_frame(results: Mapping[str, Iterable[TrialRecord]]) -> DataFrame:
+    """The trials of all jobs, one row each.
+
+    Columns are the figures of the record and
+
+    ======================  ===============================================================================
+    job, grasped            of which job; whether a pinch held the object
+    lost, not_reached       as in :class:`~torch_ekm.experiments.records.TrialRecord`
+    error_deg               steady-state error: true error at the end; of a lost object the whole angle
+    motions                 their number
+    prediction_km, ...      mean over the motions of ``prediction_km_deg``, ...; NaN where there is none
+    ======================  ===============================================================================
+
+    Args:
+        results: job -> its records.
+    """
+    rows = [
+        {"job": job, **vars(one), **_added(one), **one.more}
+        for job, records in results.items()
+        for one in records
+    ]
+    return require("pandas").DataFrame(rows).drop(columns="more")
+
+
+def select(trials: DataFrame, **wanted: Any) -> DataFrame:
+    """Trials of grasped objects with these entries."""
+    chosen = trials["grasped"].astype(bool)
+    for column, value in wanted.items():
+        chosen &= trials[column] == value
+    return trials[chosen]
+
+
+def _added(record: TrialRecord) -> dict[str, Any]:
+    made = {name: getattr(record, f"{name}_deg") for name in _PREDICTIONS}
+    return {
+        "grasped": record.grasped,
+        "lost": record.lost,
+        "not_reached": record.not_reached,
+        "error_deg": abs(record.angle_deg) if record.lost else record.true_error_deg,
+        "motions": record.steps if record.grasped else math.nan,
+        **{name: float(np.mean(errors)) if errors else math.nan for name, errors in made.items()},
+    }
 
 
 def unit_means(trials: DataFrame, column: str) -> Series:
@@ -28,9 +77,8 @@ def unit_means(trials: DataFrame, column: str) -> Series:
 
 def paired_means(ours: DataFrame, theirs: DataFrame, column: str) -> tuple[Array, Array]:
     """Unit means of two groups of trials, for the units that both have."""
-    a, b = unit_means(ours, column), unit_means(theirs, column)
-    units = a.index.intersection(b.index)
-    return a[units].to_numpy(), b[units].to_numpy()
+    a, b = unit_means(ours, column).align(unit_means(theirs, column), join="inner")
+    return a.to_numpy(), b.to_numpy()
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,7 @@ from ...typing import Array
 from ..config import CONTROLLERS, FIRST_REPORTED
 from . import statistics as stats
 from .report import Cell, Column, Table
-from .statistics import LEAST_SEEDS, DataFrame, Estimate
-from .trials import select
+from .statistics import LEAST_SEEDS, DataFrame, Estimate, select
 
 _REACHED = StopReason.REACHED.value
 #: What each controller is, in a line.
