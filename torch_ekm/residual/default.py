@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from ..exceptions import UnknownNameError
+from .kernels.kernel import fleet_options
 from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32
 from .mixture import MixtureResidual
 from .sparse_gp.deep import DeepKernelSOGP
-from .sparse_gp.defaults import fleet_options
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight

@@ -107,8 +107,7 @@ class Host(ResidualLearner):
         """
         for part in self._parts:
             part.on_rebuild(self)
-        if self.engine is None or not self.engine.rebuild(self):
-            self.posterior.rebuild(self.kernel, self.shared_noise())
+        self.posterior.rebuild(self.kernel, self.shared_noise())
         self.pending.zero_()
         for part in self._parts:
             part.after_rebuild(self)

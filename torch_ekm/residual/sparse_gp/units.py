@@ -101,9 +101,7 @@ class Standardize(Part):
         n, offset = learner.n_samples + 1, (learner.refresh_offset - _AHEAD) % BLOCK
         if n == BLOCK or (n > BLOCK and (n - offset) % BLOCK == 0):
             size = offset if offset and n == BLOCK + offset else BLOCK
-            block = learner.recent.last(n, size)[:3]
-            if learner.engine is None or not learner.engine.pool(learner, *block):
-                learner.units.pool(*block)
+            learner.units.pool(*learner.recent.last(n, size)[:3])
 
     def _adopt(self, learner: Host, *young: Tensor) -> None:
         posterior, units = learner.posterior, learner.units
