@@ -133,8 +133,8 @@ KERNELS = {
 @pytest.mark.parametrize("shape", [(), (3,)])
 @pytest.mark.parametrize("name", KERNELS)
 @pytest.mark.parametrize("memory", [0, 60])
-def test_compiled_steps_are_those_of_torch(name, shape, memory):
-    """Hyperparameters take the same way."""
+def test_compiled_steps_and_rebuilds_are_those_of_torch(name, shape, memory):
+    """Hyperparameters take the same way, in parts (one model with a memory) and at once."""
     x, y = hard_stream(130, *shape)
     fades = ForgettingFactor(0.99) if memory else ProcessNoise(0.01)
     parts = [Standardize(), RobustWeight(3.0), fades, LearnHyperparameters(steps=2, memory=memory)]
@@ -145,11 +145,28 @@ def test_compiled_steps_are_those_of_torch(name, shape, memory):
     for t in range(len(x)):
         fast.update(x[t], y[t])
         copied.update(x[t], y[t])
-        copied = copy.deepcopy(copied)
+        copied = copy.deepcopy(copied)  # between the parts of a step, too
     for a, b, c in zip(*(one.buffers() for one in (reference, fast, copied)), strict=True):
         torch.testing.assert_close(b, a, atol=1e-5, rtol=1e-5)
         assert torch.equal(b, c)
     assert torch.equal(fast(x[0]), copied(x[0]))
+
+
+@numba_here
+@pytest.mark.parametrize("shape", [(), (3,)])
+def test_compiled_units_are_those_of_numpy(shape):
+    generator = torch.Generator().manual_seed(0)
+    gp, other = (SparseOnlineGP(D, M, parts=[Standardize()], batch_shape=shape) for _ in range(2))
+    for k in range(6):
+        x = torch.randn(*shape, 32, D, generator=generator, dtype=torch.float64)
+        x = (x * 1e3 if k == 3 else x) * x.new_tensor([1.0, 0.0 if k == 2 else 1e-6, 1e150, 1.0])
+        x[..., 7 : 9 + k, :] *= 100.0
+        on = (torch.rand(*shape, 32, generator=generator) < 0.9).double()
+        assert gp.engine is not None
+        assert gp.engine.pool(gp, x, x[..., :M], on)
+        other.units.pool(x, x[..., :M], on)
+    for a, b in zip(gp.units.buffers(), other.units.buffers(), strict=True):
+        torch.testing.assert_close(a, b, atol=1e-15, rtol=1e-7)
 
 
 class Periodic(SquaredExponential):

@@ -305,9 +305,11 @@ def test_learners_rebuild_and_descend_at_different_samples(monkeypatch) -> None:
         g.update(x[t], x[t, :2])
     late, steps = ({pair for pair in pairs if pair[0] >= 128} for pairs in (rebuilt, descended))
     assert len(late) == len({t for t, _ in late}) == 8  # four rebuilds in 32 samples
-    # a step before each, of two learners one halfway, too
+    # a step before each, of two learners one halfway, too; deep ones in parts, with samples of their own
     assert len(steps) == len({t for t, _ in steps}) == 12
-    assert not {t for t, i in steps if i < 2} & {t for t, _ in late}
+    heavy = [t - part for t, i in steps if i < 2 for part in range(3)]
+    assert len(heavy) == len(set(heavy))
+    assert not set(heavy) & {t for t, i in (*late, *steps) if i == 2}
 
 
 def test_the_default_keeps_a_linear_map() -> None:

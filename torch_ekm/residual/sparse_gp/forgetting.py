@@ -60,6 +60,8 @@ class ProcessNoise(Part):
 
     def on_rebuild(self, learner: Host) -> None:
         """Wander by the samples since the last rebuild."""
+        if learner.engine is not None and learner.engine.wanders(learner):
+            return
         posterior = learner.posterior
         kept = ((1.0 - self.share) ** learner.pending)[..., None, None]
         s2 = learner.shared_noise()[..., None, None]

@@ -29,6 +29,7 @@ NETWORK_RATE = 0.015
 # features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
 NETWORK_DECAY = 0.25
 LEAST, LEAST_NOISE, MOST = -7.0, -14.0, 7.0  # of logarithms: far beyond what standardised data can mean
+PARTS = 0.45, 1.0  #: of its samples after which the parts of a step end
 _SHORT = 8  # samples between two rebuilds from which on a step leaves the last one out
 
 
@@ -37,8 +38,8 @@ class LearnHyperparameters(Part):
 
         loss(theta) = mean_t -log p(y_t | x_t, (Omega, h)_{t0}, theta),   t = t0+1 .. t0+k
 
-    before every rebuild of the caches, k = ``refresh_every``, less the last sample: a step and a rebuild do
-    not fall on the same one. The k samples were not seen by the state of k
+    before every rebuild of the caches, k = ``refresh_every``, less the last sample: of one model a step is
+    made in parts, each with another sample. The k samples were not seen by the state of k
     samples ago, so the loss cannot be won by overfitting (:class:`PrequentialLoss`). Memory: one copy of the
     state and k samples. The streaming variational bound needs as much and is a worse objective: it inflates
     the noise.
@@ -94,13 +95,18 @@ class LearnHyperparameters(Part):
         fleet = {"batch_shape": fleet, "dtype": like.dtype, "device": like.device}
         learner.recent = Recent(learner.in_features, learner.out_features, size, **fleet)
         self._leads = False
-        self.n_rebuilt = 0  #: samples that the past state has seen
+        #: samples that the past state has seen; changes of it, and of where steps begin
+        self.since = 0, 0
 
     def act(self, learner: Host) -> None:
         """Descend, and move the parameters, when it is time."""
         n = learner.n_samples + 1
         if self._is_due(learner, n):
             self.descend(learner)
+        elif learner.engine is not None and self.lead and self.memory:
+            for ahead in range(1, len(PARTS)):  # a large step in parts
+                if self._is_due(learner, n + ahead):
+                    learner.engine.descend(learner, self, n + ahead, PARTS[-1 - ahead])
         if self._leads and learner.is_due(n):
             for p, ahead in zip(self.theta(learner).values(), self.ahead().values(), strict=True):
                 p.copy_(ahead)
@@ -117,35 +123,38 @@ class LearnHyperparameters(Part):
         """The present state becomes the past one, which has seen all samples so far."""
         self.loss.snapshot(learner.posterior)
         units = learner.part(Standardize)  # new ones while they are rough: steps still lead where they led
-        self._leads = self._leads and units is not None and units.is_rough(learner)
-        self.n_rebuilt = learner.n_samples
+        self._begin(learner.n_samples, self._leads and units is not None and units.is_rough(learner))
+
+    def _begin(self, n_rebuilt: int, leads: bool = False) -> None:
+        self.since, self._leads = (n_rebuilt, self.since[1] + 1), leads
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models face another system: the state of the old one does not count."""
         self.loss.state.forget(models)
+        self._begin(self.since[0], self._leads)
 
     def reset(self) -> None:
         """Forget snapshot and step sizes."""
         self.n_steps.zero_()
         self.adam.reset()
         self.loss.state.reset()
-        self.n_rebuilt, self._leads = 0, False
+        self._begin(0)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Samples that the past state has seen, and whether steps lead away from it."""
-        return {"n_rebuilt": self.n_rebuilt, "leads": self._leads}
+        return {"n_rebuilt": self.since[0], "leads": self._leads}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.n_rebuilt, self._leads = int(state["n_rebuilt"]), bool(state["leads"])
+        self._begin(int(state["n_rebuilt"]), bool(state["leads"]))
 
     def queries(self, learner: Host, n: int) -> Queries:
         """Of n samples those since the past state, and this turn's part of those that it has seen."""
         recent = learner.recent
-        x, y, _, weight = recent.last(n, min(max(n - self.n_rebuilt, 0), self.window))
+        x, y, _, weight = recent.last(n, min(max(n - self.since[0], 0), self.window))
         absorbed = age = x.new_zeros(x.shape[-2])
         if self.memory:
             x_past, y_past, weight_past, age_past = recent.take(n, self.replayed(learner))
-            seen = (age_past > n - self.n_rebuilt).to(age_past.dtype)
+            seen = (age_past > n - self.since[0]).to(age_past.dtype)
             x, y = torch.cat([x, x_past], dim=-2), torch.cat([y, y_past], dim=-2)
             seen = seen * (age_past < recent.capacity)  # the oldest one's place may be taken
             weight = torch.cat([weight, weight_past * seen], dim=-1)
@@ -164,28 +173,26 @@ class LearnHyperparameters(Part):
         """Where steps lead to, by name."""
         return {**self.kernel.hyperparameters(), "log_noise": self.log_noise}
 
-    def start(self, learner: Host) -> None:
-        """Before a step: it starts where the last ones lead, from caches that are made there."""
-        if self._leads:
-            self.loss.state.rebuild(self.kernel, self.log_noise.mean(-1).exp())
-            return
-        for ahead, p in zip(self.ahead().values(), self.theta(learner).values(), strict=True):
-            ahead.copy_(p)
+    def start(self, learner: Host) -> bool:
+        """Before a step: it starts where the last ones lead. Whether they lead away from the caches."""
+        if not self._leads:
+            for ahead, p in zip(self.ahead().values(), self.theta(learner).values(), strict=True):
+                ahead.copy_(p)
+        return self._leads
 
     def descend(self, learner: Host) -> None:
         """A step of Adam on the loss, model by model; without samples or a finite gradient it stays."""
         n = learner.n_samples + 1
-        if learner.engine is None or not learner.engine.descend(learner, self, n):
+        if learner.engine is None or not learner.engine.descend(learner, self, n, PARTS[-1]):
             self._descend(learner, n)
-        self._leads = True
+        self._begin(self.since[0], True)
 
     def _descend(self, learner: Host, n: int) -> None:
-        self.start(learner)
-        queries = self.queries(learner, n)
+        anew, queries = self.start(learner), self.queries(learner, n)
         kernel, log_noise = copy.deepcopy(self.kernel), self.log_noise.clone()
         parameters = [p.requires_grad_(True) for p in (*kernel.hyperparameters().values(), log_noise)]
         with torch.enable_grad():
-            loss = self.loss(kernel, log_noise, queries).sum()
+            loss = self.loss(kernel, log_noise, queries, anew=anew).sum()
             gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
         on = ((queries.weight * (1.0 - queries.absorbed)).sum(-1) > 0).to(self.n_steps.dtype)
         self.n_steps += on

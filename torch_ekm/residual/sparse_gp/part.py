@@ -107,7 +107,8 @@ class Host(ResidualLearner):
         """
         for part in self._parts:
             part.on_rebuild(self)
-        self.posterior.rebuild(self.kernel, self.shared_noise())
+        if self.engine is None or not self.engine.rebuild(self):
+            self.posterior.rebuild(self.kernel, self.shared_noise())
         self.pending.zero_()
         for part in self._parts:
             part.after_rebuild(self)

@@ -27,9 +27,10 @@ from __future__ import annotations
     LEARNING,  # samples of the window, of the memory in a step; parameters, entries of their gradient
     PARAMETERS,  # rows of addresses of one and Adam's moments, size, place in the gradient, 1 (noise: 2) if
     # it is a logarithm
+    SUMS,  # of the queries of a step so far
     RATES,  # of a step, square of a robust weight's threshold (0: none), factor of forgetting
     FIELDS,
-) = range(46)  # fmt: skip
+) = range(47)  # fmt: skip
 #: of a mixture behind these, of which it has MODELS, IN, OUT and LARGEST
 (
     N_EXPERTS, N_SHARES, N_TAILS,

@@ -61,12 +61,15 @@ class PrequentialLoss(nn.Module):
         for old, new in zip(self.state.buffers(), posterior.buffers(), strict=True):
             old.copy_(new)
 
-    def forward(self, kernel: Kernel, log_noise: Tensor, queries: Queries) -> Tensor:
+    def forward(self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, anew: bool = False) -> Tensor:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], for autograd to go through.
 
-        The derivatives are those at the values by which the old state's caches were made.
+        The derivatives are those at the values by which the old state's caches were made, or, with ``anew``,
+        are made here.
         """
         state, log_s2 = self.state, log_noise.mean(-1)
+        if anew:
+            state.rebuild(kernel, log_s2.exp())
         gram = state.gram(kernel)
         K = gram.detach()
         alpha, (C, Q) = state.alpha, state.moments[..., :2, :, :].unbind(-3)

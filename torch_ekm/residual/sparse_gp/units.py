@@ -101,7 +101,9 @@ class Standardize(Part):
         n, offset = learner.n_samples + 1, (learner.refresh_offset - _AHEAD) % BLOCK
         if n == BLOCK or (n > BLOCK and (n - offset) % BLOCK == 0):
             size = offset if offset and n == BLOCK + offset else BLOCK
-            learner.units.pool(*learner.recent.last(n, size)[:3])
+            block = learner.recent.last(n, size)[:3]
+            if learner.engine is None or not learner.engine.pool(learner, *block):
+                learner.units.pool(*block)
 
     def _adopt(self, learner: Host, *young: Tensor) -> None:
         posterior, units = learner.posterior, learner.units

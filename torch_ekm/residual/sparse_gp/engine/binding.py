@@ -95,6 +95,11 @@ class Plan(Bound):
         super().__init__()
         self.units, self.changes = gp.part(Standardize), gp.part(DetectChanges)
         self.learning = gp.part(LearnHyperparameters)
+        changing = [one for one in gp._parts if type(one).on_rebuild is not Part.on_rebuild]
+        last = changing[-1] if changing else None
+        #: of ProcessNoise, where nothing else changes the natural form after it
+        self.share = last.share if isinstance(last, ProcessNoise) else 0.0
+        self.begun: tuple[Any, float] = None, 0.0  # a step in parts: which one, and how far
         self.shape = tuple(gp.batch_shape)
         self.one, self.two = (*self.shape, gp.out_features), (*self.shape, gp.out_features, gp.in_features)
         self.all = np.ones(math.prod(self.shape), np.bool_)
@@ -179,8 +184,10 @@ class Plan(Bound):
             size, noise = p.numel() // (len(self.all) if name == "log_noise" else own), name == "log_noise"
             moments = (learning.adam.get_buffer(f"{order}_{i}").data_ptr() for order in ("first", "second"))
             rows.append([p.data_ptr(), *moments, size, places[p.data_ptr()], is_logarithm(name) + noise])
-        sizes = learning.window, learning.replayed(gp), len(rows), at + gp.out_features
-        row[P.LEARNING], row[P.PARAMETERS] = self.own(np.array(sizes)), self.own(np.array(rows))
+        M, m, n = row[P.SLOTS], gp.out_features, at + gp.out_features
+        row[P.LEARNING] = self.own(np.array([learning.window, learning.replayed(gp), len(rows), n]))
+        row[P.PARAMETERS] = self.own(np.array(rows))
+        row[P.SUMS] = self.own(np.empty((len(self.all), M * (2 * M + m + row[P.WIDTH]) + n + 3)))
         return row
 
     def is_rough(self, gp: Host) -> bool:

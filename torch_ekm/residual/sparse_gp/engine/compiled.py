@@ -14,7 +14,7 @@ from ....exceptions import SpeedWarning
 from ....typing import Tensor
 from ...report import MomentsWithJacobians, UpdateReport
 from .. import plan as P
-from ..hyperparameters import LearnHyperparameters
+from ..hyperparameters import PARTS, LearnHyperparameters
 from ..part import Host
 from .binding import Bound, Engine, Plan
 from .loading import load_loops
@@ -68,17 +68,60 @@ class CompiledEngine(Engine):
         found = (torch.from_numpy(each.reshape(plan.shape)) for each in (event, *figures[:3]))
         return UpdateReport(*found)
 
-    def descend(self, gp: Host, learning: LearnHyperparameters, n: int) -> bool:
-        """A step on the loss, after n samples; False: torch must do it."""
-        plan = None if torch.compiler.is_compiling() else self.of(gp)
+    def wanders(self, gp: Host) -> bool:
+        """Whether :meth:`rebuild` does what ProcessNoise does before it."""
+        plan = self._free(gp)
+        return plan is not None and plan.share > 0.0
+
+    def rebuild(self, gp: Host) -> bool:
+        """The caches from the natural form; False: torch must do it."""
+        plan = self._free(gp)
+        if plan is not None:
+            loops: Any = load_loops()
+            loops.rebuild_fleet(plan.row, plan.share)
+        return plan is not None
+
+    def descend(self, gp: Host, learning: LearnHyperparameters, n: int, end: float) -> bool:
+        """A step on the loss, after n samples, up to this share of what it predicts; False: torch must do it.
+
+        Its parts are the same, and so is their sum, whenever they come.
+        """
+        plan = self._free(gp)
         # the gradient of one kernel for all models is a sum
         if plan is None or not (plan.row[P.OWN] or len(plan.all) == 1):
             return False
-        learning.start(gp)
         loops: Any = load_loops()
-        loops.descend_fleet(plan.past, n, learning.n_rebuilt, gp.recent.n_taken)
-        gp.recent.n_taken += 1
+        step = n, learning.since
+        begin = plan.begun[1] if plan.begun[0] == step else 0.0
+        if begin == 0.0:
+            leads = learning.start(gp)
+            loops.embed_fleet(plan.past)
+            if leads:
+                loops.rebuild_fleet(plan.past, 0.0)
+        for until in PARTS:
+            if begin < until <= end:
+                loops.gather_fleet(plan.past, n, learning.since[0], gp.recent.n_taken, begin, until)
+                begin = until
+        if end == PARTS[-1]:
+            loops.step_fleet(plan.past)
+            gp.recent.n_taken += 1
+        plan.begun = step, end
         return True
+
+    def pool(self, gp: Host, *block: Tensor) -> bool:
+        """x, y and mask of a block into the units, see ``Units.pool``; False: torch must do it."""
+        if self._free(gp) is None:
+            return False
+        loops: Any = load_loops()
+        for scale, values in zip((gp.units.input, gp.units.output), block[:2], strict=True):
+            sizes = gp.batch_shape.numel(), *values.shape[-2:], float(scale.memory)
+            pooled = scale.shifted, scale.weight, scale.centre, scale.spread, scale.large
+            tensors = values.contiguous(), block[2].contiguous(), *pooled
+            loops.pool_columns(*sizes, *(t.data_ptr() for t in tensors))
+        return True
+
+    def _free(self, gp: Host) -> Plan | None:
+        return None if torch.compiler.is_compiling() else self.of(gp)
 
     # -- what they work on ----------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ from numba import njit, types
 
 from .. import plan as P
 from ..hyperparameters import BETAS, LEAST, LEAST_NOISE, MOST, NETWORK_DECAY, NETWORK_RATE
-from .numba_core import embed_fleet, shared_noise
+from .numba_core import shared_noise
 from .numba_kernels import embed, kernel_rows, network, network_back
 from .numba_math import add_products, dot, transposed
 from .numba_memory import (
@@ -42,12 +42,30 @@ from .numba_memory import (
     vector_at,
 )
 
+#: of the queries so far: derivatives by K through E and through F, by alpha, by basis points; by all
+#: parameters; by ln s2, and weight of all and of those that the past state has not seen
+SUMS = types.Tuple((A2, A2, A2, A2, A1, A1))
+
+
+@inner(SUMS(I1, INT))
+def _sums(p, b):
+    """Memory of them."""
+    M, W, m, n = p[P.SLOTS], p[P.WIDTH], p[P.OUT], integers_at(p[P.LEARNING], 0, 4)[3]
+    at = p[P.SUMS] + 8 * b * (M * (2 * M + m + W) + n + 3)
+    by_alpha = at + 16 * M * M
+    back, gradient = by_alpha + 8 * M * m, by_alpha + 8 * M * (m + W)
+    return (
+        matrix_at(at, 0, M, M), matrix_at(at, 1, M, M), matrix_at(by_alpha, 0, M, m),
+        matrix_at(back, 0, M, W), vector_at(gradient, 0, n), vector_at(gradient + 8 * n, 0, 3),
+    )  # fmt: skip
+
 
 @inner(INT(I1, INT, INT, INT, INT, A2, A2, A2))
 def _draw(p, b, n, n_rebuilt, n_taken, values, y, about):
     """Queries in units, see ``LearnHyperparameters.queries``; returns their number.
 
-    ``about``: of each its weight, and its age if the past state has seen it, else 0.
+    Those that the past state has not seen come last: the first part of a step may begin before there is the
+    last of them. ``about``: of each its weight, and its age if the past state has seen it, else 0.
     """
     d, m, size = p[P.IN], p[P.OUT], p[P.RECENT_SIZE]
     learning = integers_at(p[P.LEARNING], 0, 2)
@@ -116,19 +134,19 @@ def _density(p, b, mean, y, diagonal, kE_u, about, by_mean, by_log_noise, by):
         by[q, 1] = by_left * (c - 1.0) + by_exact - by_most * most
 
 
-@inner(types.void(I1, INT, A2, A1, A2, A1, A2, A2, A2, A2, A2, A2, A1, types.boolean))
-def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, gradient, of_basis):
+@inner(types.void(I1, INT, A2, A1, A2, A1, A2, A2, A2, A2, A2, A2, types.boolean))
+def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, of_basis):
     """What follows of derivatives by k for the kernel's parameters.
 
     Args:
         by, by_diagonal: by ``k(x_i, z_j)`` of points i with the basis, and by ``k(x_i, x_i)``.
         k, diagonal, psi, phi: of the points, see ``kernel_rows``.
         values, q: points in units, with all layers of a network; and embedded.
-        back: derivatives by the basis points, which other points add to; ``gradient``: by all parameters.
+        back: derivatives by the basis points, which other points add to.
         of_basis: whether the points are these: a pair of them counts for both.
     """
     N, M, W, n_a, own = k.shape[0], p[P.SLOTS], p[P.WIDTH], p[P.ACTIONS], b * p[P.OWN]
-    d, n_s = p[P.IN], p[P.IN] - n_a
+    d, n_s, gradient = p[P.IN], p[P.IN] - n_a, _sums(p, b)[4]
     log_action = vector_at(p[P.LOG_ACTION], own, n_a)
     variance = math.exp(vector_at(p[P.LOG_VARIANCE], own, 1)[0])
     for i in range(N):
@@ -155,7 +173,7 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
         for i in range(M):
             c_t[j, i] = basis[i, j] - basis[0, j]
     pulled = np.zeros((N, W))
-    add_products(weights, c_t, 1.0, pulled, False)
+    add_products(weights, c_t, 1.0, pulled, False, False)
     for i in range(N):
         for j in range(W):
             pulled[i, j] -= sums[i] * a[i, j]
@@ -165,7 +183,7 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
                 pulled[i, j] = 2.0 * pulled[i, j] + back[i, j]
     else:
         later = transposed(weights)
-        add_products(later, transposed(a), 1.0, back, False)
+        add_products(later, transposed(a), 1.0, back, False, False)
         for i in range(M):
             total = 0.0
             for r in range(N):
@@ -183,9 +201,66 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
         network_back(p, own, values, features, np.empty((0, 0)), gradient)
 
 
-@inner(types.void(I1, INT, A1, F))
-def _step(p, b, gradient, total):
-    """Of Adam, of model b; ``total``: weight of all queries."""
+@njit(types.void(I1, INT, INT, INT, F, F), **COMMON)
+def gather_fleet(p, n, n_rebuilt, n_taken, begin, end):
+    """A part of a step: what the past states, whose basis is embedded, say of the queries, into the sums.
+
+    ``begin``, ``end``: of the queries, as shares of all.
+    """
+    d, m, M, W, learning = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH], integers_at(p[P.LEARNING], 0, 4)
+    most = learning[0] + learning[1]
+    x, y_, about_ = np.empty((most, d)), np.empty((most, m)), np.empty((most, 2))
+    for b in range(p[P.MODELS]):
+        by_K, less, by_alpha, back, gradient, rest = _sums(p, b)
+        if begin == 0.0:
+            by_K[:, :] = less[:, :] = by_alpha[:, :] = back[:, :] = 0.0
+            gradient[:] = rest[:] = 0.0
+        found = _draw(p, b, n, n_rebuilt, n_taken, x, y_, about_)
+        first, last, own = int(begin * found), int(end * found), b * p[P.OWN]
+        y, about, N = y_[first:last], about_[first:last], last - first
+        active, basis = vector_at(p[P.ACTIVE], b, M), matrix_at(p[P.EMBEDDED], b, M, W)
+        moments, alpha = stack_at(p[P.MOMENTS], b, 3, M, M), matrix_at(p[P.VECTORS], 2 * b, M, m)
+        values, q = np.empty((N, p[P.VALUES])), np.empty((N, W))
+        for i in range(N):
+            for j in range(d):
+                values[i, j] = x[first + i, j]
+        embed(p, own, values, q)
+        k, psi, phi, diagonal = np.empty((N, M)), np.empty((N, M)), np.empty((N, M)), np.empty(N)
+        kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal)
+        E, F_, mean = np.zeros((N, M)), np.zeros((N, M)), np.zeros((N, m))
+        add_products(k, moments[0], 1.0, E, False, False)
+        add_products(k, moments[1], 1.0, F_, False, False)
+        add_products(k, transposed(alpha), 1.0, mean, False, False)
+        kE_u, by_mean, by_q = np.empty((N, 2)), np.empty((N, m)), np.empty((N, 3))
+        for i in range(N):
+            kE_u[i, 0], kE_u[i, 1] = dot(k[i], E[i], M), dot(k[i], F_[i], M)
+        _density(p, b, mean, y, diagonal, kE_u, about, by_mean, gradient[gradient.shape[0] - m :], by_q)
+        by, by_diagonal, by_E, by_F = np.zeros((N, M)), np.empty(N), np.empty((N, M)), np.empty((N, M))
+        add_products(by_mean, alpha, 1.0, by, False, False)
+        for i in range(N):
+            rest[1] += about[i, 0]
+            rest[2] += about[i, 0] if about[i, 1] == 0.0 else 0.0
+            g_E, g_F = by_q[i, 0] + by_q[i, 1], by_q[i, 1] + by_q[i, 2]
+            by_diagonal[i] = by_q[i, 0]
+            for j in range(M):
+                by_E[i, j] = E[i, j] * g_E
+            for j in range(M):
+                by_F[i, j] = F_[i, j] * g_F
+            rest[0] += dot(by_mean[i], mean[i], m) + dot(by_E[i], k[i], M)
+            row = by[i]
+            for j in range(M):
+                row[j] += 2.0 * (by_E[i, j] + by_F[i, j])
+        E_t = transposed(E)
+        add_products(E_t, transposed(by_mean), 1.0, by_alpha, False, False)
+        add_products(E_t, transposed(by_E), 1.0, by_K, True, False)
+        add_products(transposed(F_), transposed(by_F), 1.0, less, True, False)
+        _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, False)
+
+
+@inner(types.void(I1, INT))
+def _step(p, b):
+    """Of Adam, of model b."""
+    gradient, rest = _sums(p, b)[4:]
     (b1, b2), steps = BETAS, vector_at(p[P.N_STEPS], b, 1)
     rate = vector_at(p[P.RATES], 0, 3)[0]
     steps[0] += 1.0
@@ -199,7 +274,7 @@ def _step(p, b, gradient, total):
         second = vector_at(row[2], b, size)
         step = (rate if kind > 0 else NETWORK_RATE) * correction
         for j in range(size):
-            g = by[j] / total
+            g = by[j] / rest[1]
             if kind == 0:
                 theta[j] -= decay * theta[j]
             if math.isfinite(g):
@@ -210,67 +285,25 @@ def _step(p, b, gradient, total):
                 theta[j] = min(max(theta[j], LEAST_NOISE if kind == 2 else LEAST), MOST)
 
 
-@njit(types.void(I1, INT, INT, INT), **COMMON)
-def descend_fleet(p, n, n_rebuilt, n_taken):
-    """A step of each model that has a query which its past state has not seen."""
-    d, m, M, W, learning = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH], integers_at(p[P.LEARNING], 0, 4)
-    most, jitter = learning[0] + learning[1], 1.0 + vector_at(p[P.FIGURES], 0, 3)[1]
-    x, y_, about_ = np.empty((most, d)), np.empty((most, m)), np.empty((most, 2))
-    embed_fleet(p)
+@njit(types.void(I1), **COMMON)
+def step_fleet(p):
+    """The rest of a step: the part of K in the gradient of each model, and Adam's move."""
+    d, m, M, W = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH]
+    values, k, psi, phi = np.empty((M, p[P.VALUES])), np.empty((M, M)), np.empty((M, M)), np.empty((M, M))
+    diagonal, jitter = np.empty(M), 1.0 + vector_at(p[P.FIGURES], 0, 3)[1]
     for b in range(p[P.MODELS]):
-        N, total, new = _draw(p, b, n, n_rebuilt, n_taken, x, y_, about_), 0.0, 0.0
-        for i in range(N):
-            total += about_[i, 0]
-            new += about_[i, 0] if about_[i, 1] == 0.0 else 0.0
-        if new == 0.0:
+        by_K, less, T, back, gradient, rest = _sums(p, b)
+        if rest[2] == 0.0:
             continue
-        y, about, own, by_s2 = y_[:N], about_[:N], b * p[P.OWN], 0.0
-        active, basis = vector_at(p[P.ACTIVE], b, M), matrix_at(p[P.EMBEDDED], b, M, W)
-        moments, alpha = stack_at(p[P.MOMENTS], b, 3, M, M), matrix_at(p[P.VECTORS], 2 * b, M, m)
-        values, q = np.empty((N, p[P.VALUES])), np.empty((N, W))
-        for i in range(N):
-            for j in range(d):
-                values[i, j] = x[i, j]
-        embed(p, own, values, q)
-        k, psi, phi, diagonal = np.empty((N, M)), np.empty((N, M)), np.empty((N, M)), np.empty(N)
-        kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal)
-        E, F_, mean = np.zeros((N, M)), np.zeros((N, M)), np.zeros((N, m))
-        add_products(k, moments[0], 1.0, E, False)
-        add_products(k, moments[1], 1.0, F_, False)
-        add_products(k, transposed(alpha), 1.0, mean, False)
-        kE_u, by_mean, by_q = np.empty((N, 2)), np.empty((N, m)), np.empty((N, 3))
-        for i in range(N):
-            kE_u[i, 0], kE_u[i, 1] = dot(k[i], E[i], M), dot(k[i], F_[i], M)
-        gradient, back = np.zeros(learning[3]), np.zeros((M, W))
-        _density(p, b, mean, y, diagonal, kE_u, about, by_mean, gradient[learning[3] - m :], by_q)
-        by, by_diagonal, by_E, by_F = np.zeros((N, M)), np.empty(N), np.empty((N, M)), np.empty((N, M))
-        add_products(by_mean, alpha, 1.0, by, False)
-        for i in range(N):
-            g_E, g_F = by_q[i, 0] + by_q[i, 1], by_q[i, 1] + by_q[i, 2]
-            by_diagonal[i] = by_q[i, 0]
-            for j in range(M):
-                by_E[i, j] = E[i, j] * g_E
-            for j in range(M):
-                by_F[i, j] = F_[i, j] * g_F
-            by_s2 += dot(by_mean[i], mean[i], m) + dot(by_E[i], k[i], M)
-            row = by[i]
-            for j in range(M):
-                row[j] += 2.0 * (by_E[i, j] + by_F[i, j])
-        E_t, T, by_K, less = transposed(E), np.zeros((M, m)), np.zeros((M, M)), np.zeros((M, M))
-        add_products(E_t, transposed(by_mean), 1.0, T, False)
-        add_products(E_t, transposed(by_E), 1.0, by_K, True)
-        add_products(transposed(F_), transposed(by_F), 1.0, less, True)
-        _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, back, gradient, False)
-
-        # by the basis points among themselves, K
-        values, points = np.empty((M, p[P.VALUES])), matrix_at(p[P.BASIS], b, M, d)
-        k, psi, phi, diagonal = np.empty((M, M)), np.empty((M, M)), np.empty((M, M)), np.empty(M)
+        points, own = matrix_at(p[P.BASIS], b, M, d), b * p[P.OWN]
+        alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
+        basis = matrix_at(p[P.EMBEDDED], b, M, W)
         for i in range(M):
             for j in range(d):
                 values[i, j] = points[i, j]
         network(p, own, values)
-        kernel_rows(p, own, basis, basis, active, k, psi, phi, diagonal)
-        by, by_diagonal = np.zeros((M, M)), np.empty(M)
+        kernel_rows(p, own, basis, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi, diagonal)
+        by, by_diagonal, by_s2 = np.zeros((M, M)), np.empty(M), rest[0]
         for i in range(M):
             for j in range(i + 1):
                 a = by_K[i, j] + 0.5 * (dot(T[i], alpha[j], m) + dot(alpha[i], T[j], m))
@@ -278,6 +311,6 @@ def descend_fleet(p, n, n_rebuilt, n_taken):
                 by[i, j] = by[j, i] = a - less[i, j] if j < i else 0.0
                 by_diagonal[i] = (a - less[i, j]) * jitter
         for o in range(m):
-            gradient[learning[3] - m + o] -= by_s2 / m
-        _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, basis, basis, back, gradient, True)
-        _step(p, b, gradient, total)
+            gradient[gradient.shape[0] - m + o] -= by_s2 / m
+        _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, basis, basis, back, True)
+        _step(p, b)

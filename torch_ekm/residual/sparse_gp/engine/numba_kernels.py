@@ -40,7 +40,7 @@ def network(p, own, values):
             for j in range(bias.shape[0]):
                 new[i, j] = bias[j]
         begin += n_in
-        add_products(old, matrix_at(turned, own, n_out, n_in), 1.0, new, False)
+        add_products(old, matrix_at(turned, own, n_out, n_in), 1.0, new, False, False)
         for i in range(N):
             row, to = new[i], values[i, begin : begin + n_out]
             for j in range(bias.shape[0]):
@@ -73,10 +73,10 @@ def network_back(p, own, values, by, to, gradient):
                     gradient[end + j] += by_t[j, i]
             end -= n_in * n_out
             own_part = gradient[end : end + n_in * n_out].reshape(n_in, n_out)
-            add_products(before, by_t, 1.0, own_part, False)
+            add_products(before, by_t, 1.0, own_part, False, False)
         if layer > 0 or to.shape[0] > 0:
             new = np.zeros((N, n_in))
-            add_products(by, matrix_at(weights, own, n_in, n_out), 1.0, new, False)
+            add_products(by, matrix_at(weights, own, n_in, n_out), 1.0, new, False, False)
             for i in range(N if layer > 0 else 0):
                 row, of = new[i], values[min(i, values.shape[0] - 1), begin : begin + n_in]
                 for j in range(n_in):
@@ -198,7 +198,7 @@ def kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal):
             diagonal[i] = kernel_row(p, own, q[i], basis, active, k[i], psi[i], phi[i])
         return
     k[:, :] = 0.0
-    add_products(a, c, -2.0, k, False)
+    add_products(a, c, -2.0, k, False, False)
     for i in range(N):
         for j in range(M):
             k[i, j] = max(k[i, j] + a2[i] + c2[j], 0.0)

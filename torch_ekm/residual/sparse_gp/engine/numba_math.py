@@ -78,23 +78,25 @@ def dot(a, b, n):
     return total
 
 
-@inner(types.void(A2, A2, F, A2, types.boolean))
-def add_products(A, B, a, out, lower):
+@inner(types.void(A2, A2, F, A2, types.boolean, types.boolean))
+def add_products(A, B, a, out, lower, upper):
     """``out += a A B'``, four rows by two at a time: each number that is read serves two to four sums.
 
     What a row of ``out`` gains is the same to the last bit whatever other rows there are.
 
     Args:
         lower: only what lies on and below the diagonal (and a little above).
+        upper: A is an upper triangle.
     """
     n, m, K, sums = A.shape[0], B.shape[0], A.shape[1], np.empty((2, 4))
     for i in range(0, n, 4):
-        rows, end = min(4, n - i), min(m, i + 4) if lower else m
-        a0, a1, a2, a3 = A[i], A[min(i + 1, n - 1)], A[min(i + 2, n - 1)], A[min(i + 3, n - 1)]
+        rows, end, k0 = min(4, n - i), min(m, i + 4) if lower else m, i if upper else 0
+        a0, a1 = A[i, k0:], A[min(i + 1, n - 1), k0:]
+        a2, a3 = A[min(i + 2, n - 1), k0:], A[min(i + 3, n - 1), k0:]
         for j in range(0, end, 2):
-            b, c = B[j], B[min(j + 1, m - 1)]
+            b, c = B[j, k0:], B[min(j + 1, m - 1), k0:]
             s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
-            for k in range(K):
+            for k in range(K - k0):
                 s0 += a0[k] * b[k]
                 s1 += a1[k] * b[k]
                 s2 += a2[k] * b[k]
