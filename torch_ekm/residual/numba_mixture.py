@@ -19,8 +19,11 @@ from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
 from .sparse_gp.engine import numba_core as gp
-from .sparse_gp.engine.numba_descent import descend_fleet as descend_fleet
+from .sparse_gp.engine.numba_descent import gather_fleet as gather_fleet
+from .sparse_gp.engine.numba_descent import step_fleet as step_fleet
 from .sparse_gp.engine.numba_memory import A2, A3, COMMON, I1, I2, INT, ON, inner, matrix_at, vector_at
+from .sparse_gp.engine.numba_rebuild import rebuild_fleet as rebuild_fleet
+from .sparse_gp.engine.numba_units import pool_columns as pool_columns
 
 embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
 

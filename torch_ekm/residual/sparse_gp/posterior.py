@@ -128,9 +128,11 @@ def posterior_from_natural(
         C = -(K^-1 - L^-T A^-1 L^-1),   alpha = L^-T A^-1 L'h
 
     ``L^-T A^-1 L^-1`` is the posterior covariance of ``K^-1 f``: the difference keeps its relative
-    accuracy when W is large (many repeats), where ``T'T - W`` loses all of it.
+    accuracy when W is large (many repeats), where ``T'T - W`` loses all of it. Factorised in double
+    precision for any dtype: a float32 state is limited by its storage, not by this step.
     """
-    L = torch.linalg.cholesky_ex(K)[0]
+    L = torch.linalg.cholesky_ex(K.double())[0]
+    W, h = W.double(), h.double()
     A = L.mT @ W @ L
     A.diagonal(dim1=-2, dim2=-1).add_(1.0)
     La = torch.linalg.cholesky_ex(A)[0]  # which reads its lower half alone
@@ -139,4 +141,4 @@ def posterior_from_natural(
     G = torch.linalg.solve_triangular(La, L_inv, upper=False)
     Q = L_inv.mT @ L_inv
     alpha = G.mT @ torch.linalg.solve_triangular(La, L.mT @ h, upper=False)
-    return Q, (G.mT @ G).sub_(Q), alpha
+    return Q.to(K.dtype), (G.mT @ G).sub_(Q).to(K.dtype), alpha.to(K.dtype)
