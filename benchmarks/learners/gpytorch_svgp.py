@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torch.distributions import Normal
 
-from torch_ekm.residual.kinds import SingleLearner
+from torch_ekm.residual.base import SingleLearner
 from torch_ekm.residual.report import UpdateReport
 from torch_ekm.typing import Tensor
 

@@ -10,7 +10,7 @@ from torch.distributions import Normal
 
 from .._extras import require
 from ..exceptions import NoStateError
-from ..residual.kinds import SingleLearner
+from ..residual.base import SingleLearner
 from ..residual.report import UpdateReport
 from ..typing import Tensor
 

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 from ..exceptions import UnknownNameError
+from .kernels.kernel import fleet_options
 from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32
 from .mixture import MixtureResidual
 from .sparse_gp.deep import DeepKernelSOGP
-from .sparse_gp.defaults import fleet_options
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight
@@ -62,8 +62,10 @@ def default_learner(
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     fades = [RobustWeight(3.0), ForgettingFactor(0.998), LearnHyperparameters()]
+    # it reaches twice as far as the others, since the smoothness of g is unknown; it refuses a width below 1
+    long = Matern32(d, lengthscale=2.0 * math.sqrt(max(d, 1)), **fleet)
     members = [
-        DeepKernelSOGP(d, m, base=_long(d, fleet), parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
+        DeepKernelSOGP(d, m, base=long, parts=[RobustWeight(3.0), DetectChanges()], **late[0]),
         DeepKernelSOGP(d, m, parts=[DetectChanges()], **late[1]),
         SparseOnlineGP(d, m, parts=wanders, **late[2]),
     ]
@@ -73,9 +75,3 @@ def default_learner(
     # a line through two samples extrapolates to anything, so its weight rises later
     doubts = (0.0, 0.0, 0.0, 2.0)
     return MixtureResidual(members, levels=(0.0, 0.03, 0.1, 1.0), trends=(0.0, 0.5), doubts=doubts, **options)
-
-
-def _long(d: int, fleet: dict[str, Any]) -> Matern32:
-    """A kernel that reaches twice as far as that of the others: the smoothness of g is unknown."""
-    # of a width below 1, which the kernel refuses, there is no root
-    return Matern32(d, lengthscale=2.0 * math.sqrt(max(d, 1)), **fleet)

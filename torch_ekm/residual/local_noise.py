@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from ..typing import Bool, Float, Tensor
+from .kernels.kernel import fleet_options
 from .kernels.stationary import Matern32
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.sparse_online_gp import SparseOnlineGP
@@ -37,11 +38,10 @@ class LocalNoise(nn.Module):
 
     def __init__(self, in_features: int, out_features: int, **options: Any) -> None:
         super().__init__()
-        fleet = {name: options[name] for name in ("batch_shape", "device") if name in options}
         self.gp = SparseOnlineGP(
             in_features, out_features, capacity=_CAPACITY, refresh_offset=_OFFSET, noise_variance=1.0,
-            kernel=Matern32(in_features, variance=_VARIANCE, **fleet), parts=[LearnHyperparameters()],
-            **options,
+            kernel=Matern32(in_features, variance=_VARIANCE, **fleet_options(options)),
+            parts=[LearnHyperparameters()], **options,
         )  # fmt: skip
         like = self.gp.posterior.basis
         self.shares = nn.Buffer(like.new_tensor(SHARES), persistent=False)

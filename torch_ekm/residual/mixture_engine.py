@@ -9,10 +9,9 @@ import torch
 from torch.distributions import StudentT
 
 from ..typing import Tensor
-from . import mixture_plan as G
 from .report import UpdateReport
 from .sparse_gp import plan as P
-from .sparse_gp.engine.binding import Bound, Plan
+from .sparse_gp.engine.binding import Bound, Engine, Plan
 from .sparse_gp.engine.compiled import CompiledEngine, is_plain_one, on_array
 from .sparse_gp.engine.loading import load_loops
 
@@ -31,13 +30,12 @@ class Answer(NamedTuple):
 
     mean: Tensor
     variance: Tensor  #: of g
-    deviation: Tensor  #: of g
     standard: Tensor  #: deviation of y by which innovations are standardised
     jacobian: Tensor  #: of the mean
     slope: Tensor  #: of the variance
 
 
-class CompiledMixture:
+class CompiledMixture(Engine):
     """Updates and queries of one sample per model, on the memory of the mixture and its learners.
 
     Bound again whenever a buffer is another one. Torch does the work where loops do not know a learner.
@@ -46,12 +44,6 @@ class CompiledMixture:
     def __init__(self) -> None:
         self._bound: Bound | None = None
         self._plans: list[Plan] = []  # one for each learner
-
-    def __deepcopy__(self, memo: dict) -> CompiledMixture:
-        return CompiledMixture()
-
-    def __reduce__(self) -> tuple:
-        return CompiledMixture, ()
 
     # -- calls ----------------------------------------------------------------------------------
 
@@ -62,10 +54,10 @@ class CompiledMixture:
             return None
         x, one, n = x.contiguous(), (*g.batch_shape, g.out_features), len(self._plans)
         two = *one, g.in_features
-        shapes = zip(Answer._fields, (one, one, one, one, two, two), strict=True)
+        shapes = zip(Answer._fields, (one, one, one, two, two), strict=True)
         found = Answer(*(x.new_empty(s if name == "mean" or name in wanted else 0) for name, s in shapes))
         addresses = [t.data_ptr() for t in found]
-        wants = True, any(addresses[1:4]), *map(bool, addresses[4:])
+        wants = True, any(addresses[1:3]), *map(bool, addresses[3:])
         shapes = ((n, *s) if want else (0,) for s, want in zip((one, one, two, two), wants, strict=True))
         told = [x.new_empty(shape) for shape in shapes]  # by each learner
         each, sizes = [t.data_ptr() for t in told], [8 * t.numel() // n for t in told]
@@ -123,25 +115,25 @@ class CompiledMixture:
         bound, tails = Bound(), g.tails
         at_zero = StudentT(tails.freedoms).log_prob(torch.zeros_like(tails.freedoms))
         fields = {
-            P.LARGEST: g.largest, G.EXPERTS: g._experts, G.PRIOR: g.prior, G.EVIDENCE: g.evidence,
-            G.INNOVATION: g.innovation, G.LEVEL: g.level, G.TREND: g.trend, G.GAIN: g.gain,
-            G.MASS: g.mass, G.SHIFT: g.shift, G.SPREAD: g.spread, G.OFFSET: g.offset,
-            G.INFLATION: g.inflation, G.COUNT: g.count, G.RATES: tails.rates,
-            G.FREEDOMS: tails.freedoms, G.TAIL_SCALE: tails.log_scale,
-            G.TAIL_EVIDENCE: tails.evidence, G.NOISE_EVIDENCE: g.noise.evidence,
-            G.NOISE_SHARES: g.noise.shares,
+            P.LARGEST: g.largest, P.EXPERTS: g._experts, P.PRIOR: g.prior, P.EVIDENCE: g.evidence,
+            P.INNOVATION: g.innovation, P.LEVEL: g.level, P.TREND: g.trend, P.GAIN: g.gain,
+            P.MASS: g.mass, P.SHIFTS: g.shift, P.SPREAD: g.spread, P.OFFSET: g.offset,
+            P.INFLATION: g.inflation, P.N_SEEN: g.count, P.RATES_OF_TAILS: tails.rates,
+            P.FREEDOMS: tails.freedoms, P.TAIL_SCALE: tails.log_scale,
+            P.TAIL_EVIDENCE: tails.evidence, P.NOISE_EVIDENCE: g.noise.evidence,
+            P.NOISE_SHARES: g.noise.shares,
         }  # fmt: skip
         own = g._modules, g.learners._modules, g.noise._modules
         bound.watch((g, tails, g.noise), *own, others=plans)
         bound.usable = all(
             t.is_cpu and t.is_contiguous() and t.dtype == torch.float64 for t in fields.values()
         )
-        row = bound.row = np.zeros(G.FIELDS, np.int64)
+        row = bound.row = np.zeros(P.FIELDS_OF_MIXTURE, np.int64)
         for field, tensor in fields.items():
             row[field] = tensor.data_ptr()
         row[P.MODELS], row[P.IN], row[P.OUT] = g.batch_shape.numel(), g.in_features, g.out_features
-        row[G.N_EXPERTS], row[G.N_SHARES] = g.evidence.shape[-1], g.mass.shape[-1]
-        row[G.N_TAILS], row[G.AT_ZERO] = len(tails.rates), bound.own(at_zero.numpy().copy())
+        row[P.N_EXPERTS], row[P.N_SHARES] = g.evidence.shape[-1], g.mass.shape[-1]
+        row[P.N_TAILS], row[P.AT_ZERO] = len(tails.rates), bound.own(at_zero.numpy().copy())
         bound.all = np.ones(row[P.MODELS], np.bool_)
         return bound
 

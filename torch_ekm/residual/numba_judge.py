@@ -1,8 +1,8 @@
 """How a mixture judges its experts as compiled loops, one output of one model at a time.
 
 Equations and names are those of :class:`~torch_ekm.residual.MixtureResidual` and
-:class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a row of
-:mod:`~torch_ekm.residual.mixture_plan`.
+:class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a mixture's row of
+:mod:`~torch_ekm.residual.sparse_gp.plan`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from numba import types
 
 from . import experts as E
 from . import local_noise as L
-from . import mixture_plan as G
 from .base import FARTHEST as FARTHEST_MEAN
 from .sparse_gp import plan as P
 from .sparse_gp.engine.numba_math import exp, log
@@ -45,10 +44,10 @@ def _believed(values, evidence):
 @inner(types.void(I1, INT, F, F))
 def _follow_tails(g, o, z, since):
     """See ``ScaleMixture.observe``."""
-    n = g[G.N_TAILS]
-    log_scale, evidence = vector_at(g[G.TAIL_SCALE], o, n), vector_at(g[G.TAIL_EVIDENCE], o, n)
+    n = g[P.N_TAILS]
+    log_scale, evidence = vector_at(g[P.TAIL_SCALE], o, n), vector_at(g[P.TAIL_EVIDENCE], o, n)
     rates, freedoms, at_zero = (
-        vector_at(g[G.RATES], 0, n), vector_at(g[G.FREEDOMS], 0, n), vector_at(g[G.AT_ZERO], 0, n)
+        vector_at(g[P.RATES_OF_TAILS], 0, n), vector_at(g[P.FREEDOMS], 0, n), vector_at(g[P.AT_ZERO], 0, n)
     )  # fmt: skip
     most, fastest = -np.inf, 0.5 / (1.0 + since / 4.0)
     for t in range(n):
@@ -66,14 +65,14 @@ def _follow_tails(g, o, z, since):
 @inner(F(I1, INT))
 def share_of_noise(g, o):
     """s of LocalNoise."""
-    return _believed(vector_at(g[G.NOISE_SHARES], 0, _N), vector_at(g[G.NOISE_EVIDENCE], o, _N))
+    return _believed(vector_at(g[P.NOISE_SHARES], 0, _N), vector_at(g[P.NOISE_EVIDENCE], o, _N))
 
 
 @inner(F(I1, INT, F, F))
 def _target_of_noise(g, o, size, f):
     """What f learns of a log innovation, after its evidence, see ``LocalNoise.observe``."""
     n, most = _N, -np.inf
-    shares, evidence = vector_at(g[G.NOISE_SHARES], 0, n), vector_at(g[G.NOISE_EVIDENCE], o, n)
+    shares, evidence = vector_at(g[P.NOISE_SHARES], 0, n), vector_at(g[P.NOISE_EVIDENCE], o, n)
     for s in range(n):
         log_scale = shares[s] * f
         z2 = math.exp(2.0 * (size - log_scale))
@@ -91,11 +90,11 @@ def _weigh(g, o, scale, far, p):
 
     ``p`` becomes the experts' weights, 1 at the largest.
     """
-    n, most = g[G.N_EXPERTS], -np.inf
-    experts, prior = matrix_at(g[G.EXPERTS], 0, 5, n), vector_at(g[G.PRIOR], 0, n)
+    n, most = g[P.N_EXPERTS], -np.inf
+    experts, prior = matrix_at(g[P.EXPERTS], 0, 5, n), vector_at(g[P.PRIOR], 0, n)
     rho, beta, cap = experts[2], experts[3], experts[4]
-    evidence, w = vector_at(g[G.EVIDENCE], o, n), vector_at(g[G.INNOVATION], o, n)
-    level, trend = vector_at(g[G.LEVEL], o, n), vector_at(g[G.TREND], o, n)
+    evidence, w = vector_at(g[P.EVIDENCE], o, n), vector_at(g[P.INNOVATION], o, n)
+    level, trend = vector_at(g[P.LEVEL], o, n), vector_at(g[P.TREND], o, n)
     for e in range(n):
         p[e] = log(1.0 + p[e])
     for e in range(n):
@@ -133,14 +132,14 @@ def _settle(g, o, n_learners, p, carried):
     ``carried``: room for what each carries over. Each group is a view: an index that does not begin at 0 may
     be negative for all that the compiler knows, and it does not vectorise.
     """
-    n, n_shares, total = g[G.N_EXPERTS], g[G.N_SHARES], 0.0
+    n, n_shares, total = g[P.N_EXPERTS], g[P.N_SHARES], 0.0
     n_groups = n_learners * n_shares
-    each, experts = n // n_groups, matrix_at(g[G.EXPERTS], 0, 5, n)
+    each, experts = n // n_groups, matrix_at(g[P.EXPERTS], 0, 5, n)
     h, kappa = experts[0], experts[1]
-    w, level = vector_at(g[G.INNOVATION], o, n), vector_at(g[G.LEVEL], o, n)
-    gain, offset = vector_at(g[G.GAIN], o, n_learners), vector_at(g[G.OFFSET], o, 1)
-    mass, spread = vector_at(g[G.MASS], o, n_groups), vector_at(g[G.SPREAD], o, n_groups)
-    shift = vector_at(g[G.SHIFT], o, n_groups)
+    w, level = vector_at(g[P.INNOVATION], o, n), vector_at(g[P.LEVEL], o, n)
+    gain, offset = vector_at(g[P.GAIN], o, n_learners), vector_at(g[P.OFFSET], o, 1)
+    mass, spread = vector_at(g[P.MASS], o, n_groups), vector_at(g[P.SPREAD], o, n_groups)
+    shift = vector_at(g[P.SHIFTS], o, n_groups)
     for e in range(n):
         total += p[e]
     for e in range(n):
@@ -165,7 +164,7 @@ def _settle(g, o, n_learners, p, carried):
 @inner(F(I1, INT, A1))
 def mean_of(g, o, means):
     """The mixture's, cut at twice the largest y."""
-    mean, gain = vector_at(g[G.OFFSET], o, 1)[0], vector_at(g[G.GAIN], o, means.shape[0])
+    mean, gain = vector_at(g[P.OFFSET], o, 1)[0], vector_at(g[P.GAIN], o, means.shape[0])
     for i in range(means.shape[0]):
         mean += gain[i] * means[i]
     return mean
@@ -174,8 +173,8 @@ def mean_of(g, o, means):
 @inner(F(I1, INT, A1))
 def scatter_of(g, o, noisy):
     """Variance of y as the learners state it, by their weights."""
-    n_learners, n_shares, variance = noisy.shape[0], g[G.N_SHARES], 0.0
-    mass = vector_at(g[G.MASS], o, n_learners * n_shares)
+    n_learners, n_shares, variance = noisy.shape[0], g[P.N_SHARES], 0.0
+    mass = vector_at(g[P.MASS], o, n_learners * n_shares)
     for k in range(mass.shape[0]):
         variance += mass[k] * noisy[k // n_shares]
     return variance
@@ -197,22 +196,22 @@ def judge(g, o, y, judged, since, means, noisy, far, p, local, said):
     ``local``: f of LocalNoise for each output, which becomes what it is to learn; ``said``: room for the
     mean and typical deviation.
     """
-    n, n_learners = g[G.N_EXPERTS], means.shape[0]
-    each, inflation = n // n_learners, vector_at(g[G.INFLATION], o, 1)
-    experts, most = matrix_at(g[G.EXPERTS], 0, 5, n), FARTHEST_MEAN * vector_at(g[P.LARGEST], o, 1)[0]
+    n, n_learners = g[P.N_EXPERTS], means.shape[0]
+    each, inflation = n // n_learners, vector_at(g[P.INFLATION], o, 1)
+    experts, most = matrix_at(g[P.EXPERTS], 0, 5, n), FARTHEST_MEAN * vector_at(g[P.LARGEST], o, 1)[0]
     h, kappa = experts[0], experts[1]
     f = min(max(local[o], -L.REACH), L.REACH)
     log_factor = share_of_noise(g, o) * f
     mean = min(max(mean_of(g, o, means), -most), most)
     deviation = math.sqrt(scatter_of(g, o, noisy)) * math.exp(log_factor)
-    z, tails = _bounded((y - mean) / deviation), g[G.N_TAILS]
-    log_scale = vector_at(g[G.TAIL_SCALE], o, tails)
-    typical = math.exp(_believed(log_scale, vector_at(g[G.TAIL_EVIDENCE], o, tails)))
+    z, tails = _bounded((y - mean) / deviation), g[P.N_TAILS]
+    log_scale = vector_at(g[P.TAIL_SCALE], o, tails)
+    typical = math.exp(_believed(log_scale, vector_at(g[P.TAIL_EVIDENCE], o, tails)))
     scale = deviation * typical
     said[0, o], said[1, o] = mean, scale
     if judged:
         width = min(max(E.RMS_LEAST * math.sqrt(inflation[0]) / typical, 1.0), E.RMS_MOST)
-        w, level = vector_at(g[G.INNOVATION], o, n), vector_at(g[G.LEVEL], o, n)
+        w, level = vector_at(g[P.INNOVATION], o, n), vector_at(g[P.LEVEL], o, n)
         for i in range(n_learners):
             to, share = far[i * each : (i + 1) * each], h[i * each : (i + 1) * each]
             for e in range(each):

@@ -1,9 +1,9 @@
 """A mixture and its sparse GPs as compiled loops on their own memory.
 
 Equations and names are those of :class:`~torch_ekm.residual.MixtureResidual` and
-:class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a row of
-:mod:`~torch_ekm.residual.mixture_plan`, ``members`` has one row of
-:mod:`~torch_ekm.residual.sparse_gp.plan` for each learner, and one for the GP of LocalNoise.
+:class:`~torch_ekm.residual.tails.ScaleMixture`, which stay the reference. ``g`` is a mixture's row of
+:mod:`~torch_ekm.residual.sparse_gp.plan`, ``members`` has one row for each learner, and one for the GP of
+LocalNoise.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from numba import njit, types
 
 from . import experts as E
 from . import local_noise as L
-from . import mixture_plan as G
 from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P
@@ -33,15 +32,15 @@ embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.upda
 def _of_all(g, figures, events, of_all):
     """Novelty and weight of a sample by the say of each learner, and the largest event."""
     m, n_learners = g[P.OUT], figures.shape[0] - 1
-    n_groups = n_learners * g[G.N_SHARES]
+    n_groups = n_learners * g[P.N_SHARES]
     for b in range(g[P.MODELS]):
         of_all[1, b] = of_all[2, b] = of_all[3, b] = 0.0
         for i in range(n_learners):
             of_all[3, b] = max(of_all[3, b], events[i, b])
         for r in range(b * m, (b + 1) * m):
-            mass = vector_at(g[G.MASS], r, n_groups)
+            mass = vector_at(g[P.MASS], r, n_groups)
             for k in range(n_groups):
-                i = k // g[G.N_SHARES]
+                i = k // g[P.N_SHARES]
                 of_all[1, b] += mass[k] * figures[i, 0, b] / m
                 of_all[2, b] += mass[k] * figures[i, 2, b] / m
 
@@ -63,7 +62,7 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
     if not gp.are_finite(g, x, y):
         return -1
     B, d, m, n_learners = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
-    far, p, inside = np.empty(g[G.N_EXPERTS]), np.empty(g[G.N_EXPERTS]), np.empty(m)
+    far, p, inside = np.empty(g[P.N_EXPERTS]), np.empty(g[P.N_EXPERTS]), np.empty(m)
     mean, noise, found = np.empty(m), np.empty(m), np.empty(4)
     means, noisy, local = np.empty((B * m, n_learners)), np.empty((B * m, n_learners)), np.empty(B * m)
     figures, errors = np.zeros((n_learners + 1, 4, B)), np.zeros((n_learners + 1, B, m))
@@ -89,7 +88,7 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
                     means[b * m + o, i] = mean[o]
                     noisy[b * m + o, i] = v * scale[o] * scale[o] + noise[o]
     for b in range(B):
-        count, nis = vector_at(g[G.COUNT], b, 1), 0.0
+        count, nis = vector_at(g[P.N_SEEN], b, 1), 0.0
         judged = on[b] and count[0] >= E.YOUNG
         since = max(count[0] - E.YOUNG, 0.0)
         for r in range(b * m, (b + 1) * m):
@@ -119,19 +118,19 @@ def update_mixture(g, members, numbers, on, x, y, said, of_all):
     return alarm
 
 
-@njit(types.void(I1, I2, INT, INT, INT, INT, INT, INT, INT, INT, INT, INT), **COMMON)
-def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, deviation, standard, J, dv):
+@njit(types.void(I1, I2, INT, INT, INT, INT, INT, INT, INT, INT, INT), **COMMON)
+def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, standard, J, dv):
     """One query per model from what its learners say, see ``MixtureResidual``; by addresses (0: not wanted).
 
     Args:
         means_of, latent_of: means and latent variances of all members, and derivatives.
-        variance, deviation: of g.
+        variance: of g.
         standard: deviation of y by which innovations are standardised.
         J, dv: derivatives of mean and variance by x.
     """
     B, d, m, n = g[P.MODELS], g[P.IN], g[P.OUT], members.shape[0] - 1
-    n_shares, n_experts = g[G.N_SHARES], g[G.N_EXPERTS]
-    h = matrix_at(g[G.EXPERTS], 0, 5, n_experts)[0]
+    n_shares, n_experts = g[P.N_SHARES], g[P.N_EXPERTS]
+    h = matrix_at(g[P.EXPERTS], 0, 5, n_experts)[0]
     each = n_experts // (n * n_shares)
     means, latent, noisy = np.empty((m, n)), np.empty((m, n)), np.empty((m, n))
     noise, log_factor, by_x = np.empty(m), np.zeros(m), np.zeros(m)
@@ -154,7 +153,7 @@ def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, devi
             free, most = mean_of(g, r, means[o]), FARTHEST_MEAN * vector_at(g[P.LARGEST], r, 1)[0]
             value = min(max(free, -most), most)
             vector_at(mean, r, 1)[0] = value
-            gain = vector_at(g[G.GAIN], r, n)
+            gain = vector_at(g[P.GAIN], r, n)
             if J:
                 to = vector_at(J, r, d)
                 to[:] = 0.0
@@ -164,19 +163,17 @@ def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, devi
                         to[j] += gain[i] * slope[j] if math.isfinite(slope[j]) else 0.0
             if not latent_of:
                 continue
-            mass, shift = vector_at(g[G.MASS], r, n * n_shares), vector_at(g[G.SHIFT], r, n * n_shares)
-            spread, total = vector_at(g[G.SPREAD], r, n * n_shares), 0.0
+            mass, shift = vector_at(g[P.MASS], r, n * n_shares), vector_at(g[P.SHIFTS], r, n * n_shares)
+            spread, total = vector_at(g[P.SPREAD], r, n * n_shares), 0.0
             for k in range(n * n_shares):
                 i, share = k // n_shares, h[k * each]
                 apart = share * means[o, i] + shift[k] - value
                 total += mass[k] * (share * share * latent[o, i] + apart * apart) + spread[k]
             scatter, factor = scatter_of(g, r, noisy[o]), math.exp(log_factor[o])
-            by_noise = vector_at(g[G.INFLATION], r, 1)[0] * factor * factor
+            by_noise = vector_at(g[P.INFLATION], r, 1)[0] * factor * factor
             bound = by_noise * scatter
             if standard:
                 vector_at(standard, r, 1)[0] = math.sqrt(scatter) * factor
-            if deviation:
-                vector_at(deviation, r, 1)[0] = math.sqrt(min(total, bound))
             if variance:
                 vector_at(variance, r, 1)[0] = min(total, bound)
             if dv:

@@ -144,12 +144,6 @@ class RunningScale(nn.Module):
     def _first(self) -> Float[Tensor, " features"]:
         return torch.where(self.least > 0, self.least, 1.0)
 
-    def extra_repr(self) -> str:
-        if self.scale.numel() > 12:
-            return f"features={self.scale.shape[-1]}"
-        shift, scale = ([float(f"{v:.3g}") for v in b.flatten().tolist()] for b in (self.shift, self.scale))
-        return f"shift={shift}, scale={scale}"
-
 
 class Units(nn.Module):
     """The units in which a learner works, ``z = (x - shift) / scale``, and y the same: 0 and 1 at first.

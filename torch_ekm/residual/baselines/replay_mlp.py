@@ -10,8 +10,8 @@ from torch import nn
 from ..._checks import check_count, check_counts
 from ...typing import Tensor
 from ..adam import Adam
+from ..base import SingleLearner
 from ..kernels.kernel import BufferList
-from ..kinds import SingleLearner
 from ..report import UpdateReport
 from .scaled import ScaledLearner
 

@@ -10,10 +10,10 @@ from torch.distributions import Normal
 from ...typing import Bool, Float, Tensor
 from ..base import ResidualLearner
 from ..derivatives import value_and_jacobian
-from ..misled import Misled
 from ..recent import Recent
 from ..report import UpdateReport
 from ..running_scale import BLOCK
+from ..sparse_gp.monitor import Misled
 from ..sparse_gp.units import Standardize
 
 _FAR = 2.3  # logarithm of a change of units after which a learner starts again
@@ -49,7 +49,7 @@ class ScaledLearner(ResidualLearner):
         columns = [True] * self.in_features, [self.grows and self.standardize] * self.in_features
         self.units = units.units(self.in_features, self.out_features, *columns, **fleet)
         self.recent = Recent(self.in_features, self.out_features, BLOCK, **fleet)
-        self.misled = Misled(tuple(self.batch_shape), self._kept, self.device)
+        self.misled = Misled(self._like.new_zeros(self.batch_shape))
 
     # -- f, in its own units --------------------------------------------------------------------
 

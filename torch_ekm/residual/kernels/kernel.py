@@ -9,13 +9,13 @@ optimiser would leave its caches stale).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from typing import cast
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, cast
 
 import torch
 from torch import nn
 
-from ..._checks import check_kind
+from ..._checks import check_counts, check_kind
 from ..._recorded import Recorded
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
@@ -131,6 +131,16 @@ def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...])
     if shape not in ((), tuple(batch_shape)):
         raise ParameterError("kernel", repr(kernel), valid)
     return kernel
+
+
+def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of a learner's options that its kernel shares: fleet and device.
+
+    Raises:
+        ParameterError: the fleet's shape is none.
+    """
+    check_counts("batch_shape", options.get("batch_shape", ()))
+    return {name: options[name] for name in ("batch_shape", "device") if name in options}
 
 
 def is_shared(kernel: Kernel, in_features: int) -> bool:

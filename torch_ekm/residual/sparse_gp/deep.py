@@ -6,8 +6,8 @@ from typing import Any
 from torch import nn
 
 from ..kernels.deep import DeepKernel
+from ..kernels.kernel import fleet_options
 from ..kernels.stationary import Matern32, StationaryKernel
-from .defaults import fleet_options
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
 from .monitor import CalibrateNoise, DetectChanges, RobustWeight

@@ -8,8 +8,7 @@ import torch
 from torch import nn
 
 from ..._checks import check_positive
-from ...typing import Float, Tensor
-from ..misled import Misled
+from ...typing import Bool, Float, Tensor
 from .part import Host, Part, Sample
 
 CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
@@ -19,6 +18,40 @@ RING_SIZE = 24  # samples of which those since the change are learned again
 ALARM, LARGE, _ONSET, COOL = 0.6, 5.0, 0.12, -2.0
 FACTOR_LEAST, FACTOR_MOST = -5.0, 10.0  # logarithms
 DISTRUSTED, DISTRUSTED_MOST = 0.25, 0.6  #: shares of distrusted samples
+WORSE = 16.0  #: squared errors that mislead, in squares of y
+MISLED_RATE = 1 / 16
+
+
+class Misled(nn.Module):
+    """``a += ([|y - g|^2 > 16 |y|^2] - a)/16``, misled where ``a > 0.6``: the model alone is better by far.
+
+    Where g is worth nothing an error is four times y in one of ten samples at most; ten of sixteen are
+    another system. So a learner of y of size 1 lets go where y is of size 1e-3 from now on: its noise, which
+    is of the old size, explains such innovations.
+
+    Args:
+        like: whose shape, that of the fleet, dtype and device a has.
+    """
+
+    def __init__(self, like: Tensor) -> None:
+        super().__init__()
+        self.level = nn.Buffer(torch.zeros_like(like))
+
+    def observe(
+        self, error: Float[Tensor, "*batch out"], y: Float[Tensor, "*batch out"], mask: Tensor | None
+    ) -> None:
+        """Take note of errors before the update."""
+        worse = error.square().sum(-1) > WORSE * y.square().sum(-1)
+        step = MISLED_RATE * (worse.to(self.level.dtype) - self.level)
+        self.level += step if mask is None else step * mask
+
+    def found(self) -> Bool[Tensor, "*batch"] | None:
+        """Models that are misled, which begin to count again. None: none."""
+        misled = self.level > ALARM
+        if not misled.is_cuda and not bool(misled.any()):  # on a GPU looking would mean waiting
+            return None
+        self.level.masked_fill_(misled, 0.0)
+        return misled
 
 
 class RobustWeight(Part):
@@ -105,7 +138,7 @@ class DetectChanges(Part):
         zeros, fleet = learner.posterior.basis.new_zeros, learner.posterior.batch_shape
         self.level = nn.Buffer(zeros(fleet))
         self.levels = nn.Buffer(zeros(RING_SIZE, *fleet))
-        self.misled = Misled(fleet, self.level.dtype, self.level.device)
+        self.misled = Misled(self.level)
 
     def after_update(self, learner: Host, sample: Sample) -> bool:
         """Take note of how well a sample fits."""

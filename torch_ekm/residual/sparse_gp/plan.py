@@ -1,4 +1,4 @@
-"""What compiled loops know of a sparse GP: a row of integers, sizes and addresses, in the order of this file.
+"""What compiled loops know of a sparse GP, or of a mixture: a row of integers, sizes and addresses.
 
 An address is that of the first double of a buffer, one model's after the other's; 0: there is none.
 """
@@ -31,3 +31,11 @@ from __future__ import annotations
     RATES,  # of a step, square of a robust weight's threshold (0: none), factor of forgetting
     FIELDS,
 ) = range(47)  # fmt: skip
+#: of a mixture behind these, of which it has MODELS, IN, OUT and LARGEST
+(
+    N_EXPERTS, N_SHARES, N_TAILS,
+    EXPERTS,  # rows h, kappa, rho, beta, c, a column for each expert, those of the first learner first
+    PRIOR, EVIDENCE, INNOVATION, LEVEL, TREND, GAIN, MASS, SHIFTS, SPREAD, OFFSET, INFLATION, N_SEEN,
+    RATES_OF_TAILS, FREEDOMS, AT_ZERO,  # of the tails' laws, and their log density at 0
+    TAIL_SCALE, TAIL_EVIDENCE, NOISE_EVIDENCE, NOISE_SHARES, FIELDS_OF_MIXTURE,
+) = range(FIELDS, FIELDS + 24)  # fmt: skip

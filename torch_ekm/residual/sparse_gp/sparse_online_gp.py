@@ -16,10 +16,12 @@ from ..printed import sparse_gp
 from ..recent import Recent
 from ..report import MomentsWithJacobians, UpdateReport
 from ..running_scale import BLOCK, RunningScale, Units
-from .defaults import chosen_parts
 from .engine.compiled import CompiledEngine
 from .engine.recursion import absorb
-from .part import Host, Part, Sample
+from .forgetting import ProcessNoise
+from .hyperparameters import LearnHyperparameters
+from .monitor import CalibrateNoise, DetectChanges, RobustWeight
+from .part import Host, Part, Sample, copy_parts
 from .posterior import SparsePosterior
 from .units import Standardize
 
@@ -106,7 +108,10 @@ class SparseOnlineGP(Host):
         self.n_samples = 0  # on the host, so that the rhythm of rebuilds never asks the GPU
         self.units = Units(*(RunningScale(size, **fleet) for size in sizes[:2]))
         self.recent, self._parts = Recent(*sizes[:2], BLOCK, **fleet, dtype=torch.float64), ()
-        for part in chosen_parts(parts, standardize):
+        own = default_parts() if parts is None else copy_parts(parts)
+        if standardize and not any(isinstance(part, Standardize) for part in own):
+            own[:0] = copy_parts([standardize if isinstance(standardize, Standardize) else Standardize()])
+        for part in own:
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
@@ -280,3 +285,9 @@ class SparseOnlineGP(Host):
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self.n_samples = int(state["n_samples"])
+
+
+def default_parts() -> list[Part]:
+    """What bears outliers, slow and abrupt changes, holds its intervals, and learns kernel and noise."""
+    wandering = ProcessNoise(0.001)
+    return [RobustWeight(3.0), DetectChanges(), wandering, CalibrateNoise(), LearnHyperparameters()]

@@ -33,6 +33,16 @@ _PARTS = (
 _KINDS = {SquaredExponential: 0, Matern32: 1}  # as numba_kernels has them
 
 
+class Engine:
+    """Knows memory by address, so a copy of it begins anew."""
+
+    def __deepcopy__(self, memo: dict) -> Engine:
+        return type(self)()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), ()
+
+
 class Bound:
     """A module's memory as compiled loops see it, and whether it is still the module's."""
 

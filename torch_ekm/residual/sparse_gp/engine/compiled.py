@@ -16,13 +16,13 @@ from ...report import MomentsWithJacobians, UpdateReport
 from .. import plan as P
 from ..hyperparameters import PARTS, LearnHyperparameters
 from ..part import Host
-from .binding import Bound, Plan
+from .binding import Bound, Engine, Plan
 from .loading import load_loops
 
 _LEFT = "{} learns by torch, which takes several times as long as compiled loops: {}"
 
 
-class CompiledEngine:
+class CompiledEngine(Engine):
     """Updates and queries of one sample per model by compiled loops, on the learner's own memory.
 
     Torch does the work without numba, on another device, in float32, where a gradient is to be carried,
@@ -33,12 +33,6 @@ class CompiledEngine:
     def __init__(self) -> None:
         self._plan: Plan | None = None
         self._told = False
-
-    def __deepcopy__(self, memo: dict) -> CompiledEngine:
-        return CompiledEngine()
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return CompiledEngine, ()
 
     # -- calls ----------------------------------------------------------------------------------
 

@@ -16,10 +16,6 @@ from ....exceptions import SpeedWarning
 
 _LAST = "torch_ekm.residual.numba_mixture"  #: of the modules of loops, which imports the others
 _LAST_LOOP = "mix_fleet"  #: of that module: what is compiled last
-_SOURCES = (  # what loops are made of, with the figures that stand in them
-    "**/numba_*.py", "**/*plan.py", "sparse_gp/monitor.py", "sparse_gp/hyperparameters.py", "**/recursion.py",
-    "kernels/stationary.py", "running_scale.py", "experts.py", "local_noise.py", "tails.py", "misled.py",
-)  # fmt: skip
 _OFF = (
     "compiled loops are off, so learners take longer: {}; if numba cannot write its cache, set "
     "NUMBA_CACHE_DIR to a folder that can be written"
@@ -88,12 +84,12 @@ def _imported() -> ModuleType | None:
 def _is_cached() -> bool:
     """Whether what numba made of the last of the loops is there, as far as one can see.
 
-    Numba looks at the file of a loop alone: what it made before any of the files changed goes.
+    Numba looks at the file of a loop alone: what it made before any file of the learners changed goes, since
+    figures of others stand in it.
     """
     from numba.misc.appdirs import user_cache_dir
 
-    source, given = Path(__file__).parents[2], os.environ.get("NUMBA_CACHE_DIR")
-    sources = [file for pattern in _SOURCES for file in source.glob(pattern)]
+    given, sources = os.environ.get("NUMBA_CACHE_DIR"), list(Path(__file__).parents[2].rglob("*.py"))
     written = max(file.stat().st_mtime for file in sources)
     names = [f"{file.stem}.*.py{sys.version_info.major}{sys.version_info.minor}.nbi" for file in sources]
     folders = [Path(given)] if given else [Path(user_cache_dir("numba", False)), *{f.parent for f in sources}]

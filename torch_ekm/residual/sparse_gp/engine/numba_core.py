@@ -11,9 +11,8 @@ import numpy as np
 from numba import njit, types
 
 from ...base import FARTHEST
-from ...misled import MISLED_RATE, WORSE
+from .. import monitor as N
 from .. import plan as P
-from ..monitor import ALARM, CALIBRATION_RATE, FACTOR_LEAST, FACTOR_MOST, LARGE, RATE, RING_SIZE, Z90_SQUARED
 from .numba_kernels import embed, kernel_row, kernel_slopes, network_back, turn_weights
 from .numba_math import exp
 from .numba_memory import A1, A2, COMMON, I1, INT, ON, F, inner, integers_at, matrix_at, vector_at
@@ -212,10 +211,10 @@ def changed(p, n, on, y, figures, errors):
             for o in range(m):
                 t = (y_[o] - shift[o]) / scale[o]
                 wrong, size = wrong + errors[b, o] * errors[b, o], size + t * t
-            level[0] += RATE * ((1.0 if figures[1, b] > LARGE else 0.0) - level[0])
-            misled[0] += MISLED_RATE * ((1.0 if wrong > WORSE * size else 0.0) - misled[0])
-        vector_at(p[P.LEVELS], n % RING_SIZE * p[P.MODELS] + b, 1)[0] = level[0] if on[b] else np.inf
-        alarm |= level[0] > ALARM or misled[0] > ALARM
+            level[0] += N.RATE * ((1.0 if figures[1, b] > N.LARGE else 0.0) - level[0])
+            misled[0] += N.MISLED_RATE * ((1.0 if wrong > N.WORSE * size else 0.0) - misled[0])
+        vector_at(p[P.LEVELS], n % N.RING_SIZE * p[P.MODELS] + b, 1)[0] = level[0] if on[b] else np.inf
+        alarm |= level[0] > N.ALARM or misled[0] > N.ALARM
     return alarm
 
 
@@ -237,9 +236,9 @@ def note(p, n, on, x, y, figures, errors):
             factor, log_noise = vector_at(p[P.FACTOR], b, m), vector_at(p[P.LOG_NOISE], b, m)
             for o in range(m):
                 variance = figures[3, b] + math.exp(log_noise[o]) * math.exp(factor[o])
-                missed = 1.0 if errors[b, o] * errors[b, o] > Z90_SQUARED * variance else 0.0
-                moved = factor[o] + CALIBRATION_RATE * (missed - 0.1)
-                factor[o] = min(max(moved, FACTOR_LEAST), FACTOR_MOST)
+                missed = 1.0 if errors[b, o] * errors[b, o] > N.Z90_SQUARED * variance else 0.0
+                moved = factor[o] + N.CALIBRATION_RATE * (missed - 0.1)
+                factor[o] = min(max(moved, N.FACTOR_LEAST), N.FACTOR_MOST)
     return p[P.CHANGED] != 0 and changed(p, n, on, y, figures, errors)
 
 

@@ -5,6 +5,8 @@ They vectorise where they stand in a loop, as those of the C library do not.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import types
 
@@ -14,6 +16,9 @@ _EXACT = {"contract"}  # sums in the order in which they stand
 _TO_INTEGER = 6755399441055744.0  # 1.5 * 2^52: its last bits are those of what was added
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.9082149292705877e-10
 _MANTISSA, _ONE = 0xFFFFFFFFFFFFF, 0x3FF0000000000000  # bits of a double: the last 52, and those of 1.0
+# Taylor's series, the last term first: e^r up to r^13, artanh(s)/s without the 1 up to s^20
+_OF_EXP = tuple(1.0 / math.factorial(n) for n in range(13, -1, -1))
+_OF_LOG = tuple(1.0 / n for n in range(21, 2, -2))
 
 
 @made
@@ -42,20 +47,9 @@ def exp(x):
     x = min(max(x, -708.0), 709.0)
     n = x * 1.4426950408889634 + _TO_INTEGER
     r = (x - (n - _TO_INTEGER) * _LN2_HIGH) - (n - _TO_INTEGER) * _LN2_LOW
-    p = 1.0 / 6227020800.0  # Taylor's series up to r^13, |r| <= ln(2)/2
-    p = p * r + 1.0 / 479001600.0
-    p = p * r + 1.0 / 39916800.0
-    p = p * r + 1.0 / 3628800.0
-    p = p * r + 1.0 / 362880.0
-    p = p * r + 1.0 / 40320.0
-    p = p * r + 1.0 / 5040.0
-    p = p * r + 1.0 / 720.0
-    p = p * r + 1.0 / 120.0
-    p = p * r + 1.0 / 24.0
-    p = p * r + 1.0 / 6.0
-    p = p * r + 0.5
-    p = p * r + 1.0
-    p = p * r + 1.0
+    p = 0.0
+    for a in _OF_EXP:  # |r| <= ln(2)/2
+        p = p * r + a
     return p * _as_float((_bits(n) << 52) + _ONE)
 
 
@@ -69,16 +63,9 @@ def log(y):
     m, e = (0.5 * m if high else m), (e + 1.0 if high else e)
     s = (m - 1.0) / (m + 1.0)
     q = s * s
-    p = 1.0 / 21.0
-    p = p * q + 1.0 / 19.0
-    p = p * q + 1.0 / 17.0
-    p = p * q + 1.0 / 15.0
-    p = p * q + 1.0 / 13.0
-    p = p * q + 1.0 / 11.0
-    p = p * q + 1.0 / 9.0
-    p = p * q + 1.0 / 7.0
-    p = p * q + 0.2
-    p = p * q + 1.0 / 3.0
+    p = 0.0
+    for a in _OF_LOG:
+        p = p * q + a
     return e * 0.6931471805599453 + 2.0 * s * (p * q + 1.0)
 
 
