@@ -15,6 +15,17 @@ from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation
 
 
+def one_more(field: str, place: int, size: float) -> Fault:
+    """One entry of a reading is off by so much."""
+
+    def change(plant: Obedient, seen: Observation) -> Observation:
+        value = getattr(seen, field).clone()
+        value[place] += size
+        return dataclasses.replace(seen, **{field: value})
+
+    return change
+
+
 def turned(seen: Observation, axis: torch.Tensor, angle: float) -> Observation:
     """``seen`` with its object turned further by ``angle`` [rad]."""
     return dataclasses.replace(seen, rotation=exp(angle * axis) @ seen.rotation)

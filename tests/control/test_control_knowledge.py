@@ -11,13 +11,7 @@ from obedient_plant import Obedient
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.control import (
-    ClosedLoop,
-    DescribedFigures,
-    HandKnowledge,
-    LookAndMoveController,
-    PoseTarget,
-)
+from torch_ekm.control import ClosedLoop, DescribedFigures, HandKnowledge, LookAndMoveController, PoseTarget
 from torch_ekm.control.knowledge import ModelError, previous
 from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity

@@ -158,10 +158,8 @@ def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
     shapes = tuple(shape.scaled(0.85) for shape in model.obj.shapes)
     thin = KinematicModel(model.hand, dataclasses.replace(model.obj, shapes=shapes))
     for told, learns, surface in ((thin, True, 0.00225), (thin, False, 0.0), (model, True, 0.0)):
-        controller, known = (
-            LookAndMoveController(EnhancedModel.for_grasp(told, seen.state), axis),
-            HandKnowledge.of(model.hand),
-        )
+        controller = LookAndMoveController(EnhancedModel.for_grasp(told, seen.state), axis)
+        known = HandKnowledge.of(model.hand)
         controller.follow(known.figures, known.forces)
         lessons = Lessons(controller, known, known.figures if learns else DescribedFigures())
         lessons.touch(seen, lambda _: 0.0)  # joints that are off explain it better
@@ -171,11 +169,8 @@ def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
         assert followed.surface == pytest.approx(surface, abs=0.0005)
         if surface:
             gaps = followed.contacts(seen.state, seen.fingertip_force).gap
-            assert (
-                float(gaps.abs().max())
-                < 0.0005
-                < float(thin.contacts(seen.state, seen.fingertip_force).gap.min())
-            )
+            described = thin.contacts(seen.state, seen.fingertip_force).gap
+            assert float(gaps.abs().max()) < 0.0005 < float(described.min())
         assert told.surface == 0.0
         lessons.begin(seen)
         assert followed.surface == 0.0

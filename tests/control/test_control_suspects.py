@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from obedient_plant import Fault, Obedient
+from obedient_plant import Fault, Obedient, one_more
 
 from torch_ekm.control import (
     ClosedLoop,
@@ -39,18 +39,9 @@ def run(held, fault: Fault, since: int) -> Manipulation:
     return loop.run(PoseTarget.turned(seen.state, axis, degrees=12))
 
 
-def more(field: str, place: int, size: float) -> Fault:
-    def change(plant: Obedient, seen: Observation) -> Observation:
-        value = getattr(seen, field).clone()
-        value[place] += size
-        return dataclasses.replace(seen, **{field: value})
-
-    return change
-
-
 OFF = {  # 8 mm, 17 deg: less than what is called a jump
-    "pose": (more("position", 0, 0.008), "the object went along x", "fingertips press ("),
-    "joint": (more("q", 6, -17 * DEG), "joint 'index_2' turned", "fingertips press (index)"),
+    "pose": (one_more("position", 0, 0.008), "the object went along x", "fingertips press ("),
+    "joint": (one_more("q", 6, -17 * DEG), "joint 'index_2' turned", "fingertips press (index)"),
 }  # fmt: skip
 
 

@@ -15,13 +15,7 @@ from torch_ekm.description.registry import object_paths
 from torch_ekm.exceptions import ParameterError, UnknownNameError
 from torch_ekm.experiments.config import CONTROLLERS, Setting, digest
 from torch_ekm.experiments.learners import HAND_LEARNERS, make_learner
-from torch_ekm.experiments.protocols.generalize import (
-    ENDS,
-    OTHER_ANGLES,
-    SHARES,
-    TABLE_I,
-    Generalize,
-)
+from torch_ekm.experiments.protocols.generalize import ENDS, OTHER_ANGLES, SHARES, TABLE_I, Generalize
 from torch_ekm.experiments.protocols.online import Online
 from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord
 from torch_ekm.experiments.runner import Bench
@@ -120,18 +114,6 @@ def test_every_learner_for_a_hand_starts_at_zero_and_learns() -> None:
         assert better == 1.0 if name == "model alone" else better < 0.7, (name, better)
     with pytest.raises(UnknownNameError, match="rbf"):
         make_learner("forest", 5, 4, 30)
-
-
-def test_impossible_protocols_are_refused() -> None:
-    with pytest.raises(ParameterError, match="objects"):
-        Generalize(objects=())
-    for angles in ((0.0,), (200.0,), ()):
-        with pytest.raises(ParameterError, match="angles_deg"):
-            Generalize(angles_deg=angles)
-    with pytest.raises(UnknownNameError, match="KM\\+I"):
-        Generalize(controllers=("PID",))
-    with pytest.raises(UnknownNameError, match="KM\\+I"):
-        ONLINE.session("PID", 0)
 
 
 # -- with the simulation -----------------------------------------------------------------------------

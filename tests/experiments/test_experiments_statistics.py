@@ -27,13 +27,7 @@ from torch_ekm.experiments.reporting.statistics import (
     rate,
     unit_means,
 )
-from torch_ekm.experiments.reporting.tables import (
-    controller_table,
-    error_table,
-    ratio,
-    reason_table,
-    verdict,
-)
+from torch_ekm.experiments.reporting.tables import controller_table, error_table, ratio, reason_table, verdict
 from torch_ekm.experiments.reporting.trials import select
 
 # -- records -----------------------------------------------------------------------------------------

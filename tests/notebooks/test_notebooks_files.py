@@ -10,10 +10,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 from torch_ekm.exceptions import DescriptionError
-from torch_ekm.experiments.reporting.notebook import (
-    copy_notebooks,
-    notebook_folder,
-)
+from torch_ekm.experiments.reporting.notebook import copy_notebooks, notebook_folder
 from torch_ekm.experiments.reporting.plots import new_figure
 from torch_ekm.experiments.reporting.report import Table
 

@@ -10,7 +10,6 @@ from hostile_streams import EVENTS, LEARNERS, Hostile, judge
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from torch_ekm.exceptions import ParameterError
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernel,
@@ -50,16 +49,6 @@ def test_no_stream_makes_it_say_nonsense(name, hostile):
     verdict = judge(LEARNERS[name](6), *hostile.samples())
     assert verdict.not_finite == 0, hostile
     assert verdict.ratio <= 3.0, hostile
-
-
-@EVERY
-@pytest.mark.parametrize("jitter", [1e-12, 1e-6])
-def test_an_input_that_stood_still_begins_to_move(name, jitter):
-    """Without bounds 1e10 and 1e4 times y with a linear kernel, and NaN for good."""
-    stream = Hostile(0, 80, 1.0, 1.0, 0.0, jitter, ("input stands still",))
-    verdict = judge(LEARNERS[name](20), *stream.samples())
-    assert verdict.not_finite == 0
-    assert verdict.ratio <= 2.0
 
 
 @pytest.mark.parametrize(
@@ -223,13 +212,6 @@ def test_an_output_below_its_scale_is_noise_of_that_scale():
         assert float(made.predict(x[0], observation=True).stddev.min()) > 1e-5
 
 
-@pytest.mark.parametrize("bad", [-1.0, float("nan"), [1.0, 2.0], "a", [1.0, None, 1.0, 1.0]])
-@pytest.mark.usefixtures("unchecked")
-def test_a_scale_that_is_none_is_refused(bad):
-    with pytest.raises(ParameterError, match="input_resolution"):
-        default_learner(4, 2, input_resolution=bad)
-
-
 @EVERY
 def test_bounds_are_part_of_the_state(name):
     x, y = Hostile(0, 30, 1.0, 1.0, 0.0, 0.0, ()).samples()
@@ -261,13 +243,14 @@ def test_compiled_loops_cut_where_torch_does(kernel):
 
 
 @pytest.mark.parametrize("engine", ["compiled", "torch"])
-def test_a_point_without_effect_makes_no_basis_vector(engine):
-    """Its variance is that of an action of 1e-17, whose inverse would multiply what comes."""
+@pytest.mark.parametrize("action", [0.0, 1e-17])
+def test_a_point_without_effect_makes_no_basis_vector(engine, action):
+    """The inverse of its variance, of 1e-34, would multiply what comes."""
     gp = SparseOnlineGP(2, 1, kernel=ActionLinearKernel(2, 1), parts=(), standardize=False)
     if engine == "torch":
         gp.engine = None
     one = torch.ones(1, dtype=torch.float64)
-    gp.update(torch.tensor([0.3, 1e-17], dtype=torch.float64), one)
+    assert float(gp.update(torch.tensor([0.3, action], dtype=torch.float64), one).novelty) < 1e-9
     gp.update(torch.tensor([0.2, 1.0], dtype=torch.float64), one)
     assert int(gp.posterior.count) == 1
     assert float(gp.posterior.moments.abs().max()) < 1e3
