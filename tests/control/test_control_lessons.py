@@ -8,7 +8,7 @@ import math
 
 import pytest
 import torch
-from obedient_plant import Obedient
+from obedient_plant import Obedient, untaught
 
 from torch_ekm.control import (
     ClosedLoop,
@@ -135,10 +135,8 @@ def test_a_motion_is_a_path_of_one_piece(held, pieces) -> None:
 
 @pytest.mark.parametrize(("less", "learns"), [(0.3, True), (4.0, False)])
 def test_a_finger_that_slid_or_gave_its_load_away_says_nothing_of_forces(held, less, learns) -> None:
-    seen, axis, model = held
-    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-    loop = ClosedLoop(Obedient(model, seen), controller)
-    target = PoseTarget.turned(seen.state, axis, degrees=5)
+    (seen, axis, _), loop = held, untaught(held)
+    controller, target = loop.controller, PoseTarget.turned(seen.state, axis, degrees=5)
     decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
     expected = controller.expect(decision.pieces, decision.delta_a)
     assert expected.normal is not None

@@ -72,8 +72,7 @@ def of_kind(kind: type[Kernel], fleet: tuple[int, ...]) -> Kernel:
 
 
 @pytest.mark.parametrize("fleet", [(), (3,)])
-@pytest.mark.parametrize("robust", [None, 3.0])
-@pytest.mark.parametrize("fading", [[], [ForgettingFactor(0.98)]])
+@pytest.mark.parametrize(("robust", "fading"), [(None, []), (3.0, [ForgettingFactor(0.98)])])
 @pytest.mark.parametrize("kind", [SquaredExponential, Matern32, DeepKernel])
 def test_gradients_are_those_of_dense_algebra(kind, robust, fleet, fading):
     kernel = of_kind(kind, fleet)
@@ -249,19 +248,6 @@ def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
         assert float(torch.linalg.cond(gp.posterior.gram(gp.kernel))) < 1e9
     torch.testing.assert_close(errors[0][0], errors[1][0], atol=1e-6, rtol=0)
     assert errors[2][1] < 1.3 * errors[0][1]
-
-
-def test_features_learned_from_the_past_beat_those_of_the_last_samples():
-    rng = np.random.default_rng(3)
-    x = torch.from_numpy(rng.uniform(-1, 1, (1800, 6)))
-    y = torch.sin(3.0 * x[:, :1] * x[:, 1:2]) + torch.cos(2.5 * (x[:, 2:3] + x[:, 3:4] * x[:, 4:5]))
-    errors = []
-    for memory in (0, 1000):
-        parts = [LearnHyperparameters(steps=2, memory=memory)]
-        gp = deep_sogp(6, 1, capacity=40, noise_variance=0.1, parts=parts)
-        gp.update(x[:1400], y[:1400])
-        errors.append(float((gp(x[1400:]) - y[1400:]).square().mean().sqrt()))
-    assert errors[1] < 0.85 * errors[0]
 
 
 def test_after_a_change_the_memory_holds_the_new_system_only():

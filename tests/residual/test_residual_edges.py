@@ -13,6 +13,7 @@ from as_published import deep_sogp, sogp
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, StateError, UnknownNameError
 from torch_ekm.residual import (
+    ActionLinearKernel,
     DeepKernelSOGP,
     DetectChanges,
     ForgettingFactor,

