@@ -19,16 +19,9 @@ shapes.install()  # before anything imports the package
 torch.set_num_threads(1)  # many small matrices: threads only get into each other's way
 # examples are drawn from a fixed seed, and no clock decides on a slow machine
 hypothesis.settings.register_profile(
-    "repeatable",
-    derandomize=True,
-    deadline=None,
-    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+    "repeatable", derandomize=True, deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
 )
 hypothesis.settings.load_profile("repeatable")
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--device", default="cpu", help="device on which the learners' tests run")
 
 
 def pytest_collection_finish() -> None:
@@ -36,12 +29,6 @@ def pytest_collection_finish() -> None:
 
     warm_up()  # tests of bits must not depend on when loops are compiled
     gc.freeze()  # what is imported stays: the collector need not go through it again and again
-
-
-@pytest.fixture
-def device(request: pytest.FixtureRequest) -> torch.device:
-    """Device of the run: ``pytest --device cuda`` runs the suite on a GPU."""
-    return torch.device(request.config.getoption("--device"))
 
 
 @pytest.fixture

@@ -88,7 +88,7 @@ _ROOMS = """
 import importlib
 from torch_ekm.exceptions import MissingExtraError
 
-for room in ("plant", "sensing", "simulation", "rendering", "interop"):
+for room in ("plant", "sensing", "simulation", "rendering", "interop", "experiments"):
     importlib.import_module(f"torch_ekm.{room}")
 from torch_ekm import interop
 

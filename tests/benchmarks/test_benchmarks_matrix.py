@@ -24,7 +24,6 @@ from matrix import FIGURES, bands_table, ends_table, verdict
 from questions import QUESTIONS
 from sessions import TARGETS, Part, target_of
 
-from torch_ekm.control.watch import OnTheWay
 from torch_ekm.experiments import runner
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.records import NOT_GRASPED, TrialRecord
@@ -156,16 +155,6 @@ def test_a_question_runs_and_what_is_done_is_kept(tmp_path: Path, capsys: pytest
     assert (tmp_path / "whole_turn.svg").exists()
     with pytest.raises(SystemExit):
         matrix.main(["whole_turn", "--contenders", "PID"])
-
-
-def test_movements_of_a_loop_without_watch_go_to_their_end(tmp_path: Path, monkeypatch) -> None:
-    asked, watch = [], OnTheWay.__call__
-    monkeypatch.setattr(OnTheWay, "__call__", lambda *given: asked.append(1) or watch(*given))
-    for name, watched in (("as it is", True), ("no watch on the way", False)):
-        asked.clear()
-        words = ["plan", "--quick", "--contenders", name, "--hands", "nominal", "--jobs", "1"]
-        matrix.main([*words, "--out", str(tmp_path)])
-        assert bool(asked) == watched
 
 
 @pytest.mark.parametrize("name", ["generalize", "series", "directions", "printed", "new_object", "slides"])

@@ -13,13 +13,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from torch_ekm.contact.signed_distance import point_distance, surface_curvature, tangents
-from torch_ekm.description import (
-    ContactPad,
-    ObjectDescription,
-    Shape,
-    load_hand,
-    load_object,
-)
+from torch_ekm.description import ContactPad, ObjectDescription, Shape, load_hand, load_object
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.kinematics.se3 import exp
@@ -32,12 +26,7 @@ F64 = torch.float64
 EYE = torch.eye(3, dtype=F64)
 HAND, BOX = load_hand("planar_two_finger"), load_object("box")
 RADIUS, HALF = 0.0065, 0.00718
-SHAPES = {
-    "box": (0.09, 0.03, 0.04),
-    "cylinder": (0.02, 0.08),
-    "sphere": (0.025,),
-    "capsule": (0.015, 0.05),
-}
+SHAPES = {"box": (0.09, 0.03, 0.04), "cylinder": (0.02, 0.08), "sphere": (0.025,), "capsule": (0.015, 0.05)}
 DEPTH = {"box": 0.015, "cylinder": 0.02, "sphere": 0.025, "capsule": 0.015}  # from side to middle
 
 

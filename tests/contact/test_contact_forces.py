@@ -10,13 +10,7 @@ import qpsolvers
 from contact_samples import THREE, held
 from force_oracles import cone_program, gaussian_posterior
 
-from torch_ekm.contact import (
-    ForceOptions,
-    ForceStatus,
-    contact_forces,
-    grasp_matrix,
-    hand_jacobian,
-)
+from torch_ekm.contact import ForceOptions, ForceStatus, contact_forces, grasp_matrix, hand_jacobian
 from torch_ekm.contact.forces import problem, solve
 from torch_ekm.contact.forces.problem import BalanceEquations, friction_cones, margins
 from torch_ekm.contact.forces.solve import EqualityProgram, solve_by_active_set
@@ -199,10 +193,7 @@ def expecting(eq: BalanceEquations, seed=0, size=0.3) -> BalanceEquations:
 
 
 @pytest.mark.parametrize("gamma", [0.0, 0.01])
-@pytest.mark.parametrize(
-    "measured",
-    [{}, {"measured_normal": np.array([3.1, np.nan, 2.7])}],
-)
+@pytest.mark.parametrize("measured", [{}, {"measured_normal": np.array([3.1, np.nan, 2.7])}])
 def test_expected_forces_and_measurements_give_the_gaussian_posterior(gamma, measured):
     eq, options = expecting(equations(friction=3.0, gamma=gamma, **measured)), ForceOptions()
     solution = contact_forces(eq, options)

@@ -80,16 +80,7 @@ LEARNERS = {
     "deep": deep,
     "deep_sogp": lambda **o: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), refresh_every=4, **o),
 }
-FLEETS = (
-    "zero",
-    "rls",
-    "rff",
-    "sogp",
-    "sogp_all",
-    "sogp_process_noise",
-    "mixture_of_two",
-    "deep",
-)
+FLEETS = ("zero", "rls", "rff", "sogp", "sogp_all", "sogp_process_noise", "mixture_of_two", "deep")
 
 
 @pytest.mark.parametrize("name", LEARNERS)

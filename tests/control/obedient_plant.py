@@ -10,9 +10,28 @@ import torch
 from light_plant import Fault as Fault
 from light_plant import Obedient as Obedient
 
-from torch_ekm.control import ClosedLoop, Manipulation, PoseTarget, Step
+from torch_ekm.control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, Step
+from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation
+
+
+def one_more(field: str, place: int, size: float) -> Fault:
+    """One entry of a reading is off by so much."""
+
+    def change(plant: Obedient, seen: Observation) -> Observation:
+        value = getattr(seen, field).clone()
+        value[place] += size
+        return dataclasses.replace(seen, **{field: value})
+
+    return change
+
+
+def untaught(held: tuple, *fault: Fault, since: int = 2, **options: object) -> ClosedLoop:
+    """An E-KM that has learned nothing turns about the held axis; its plant obeys the kinematic model."""
+    seen, axis, model = held
+    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
+    return ClosedLoop(Obedient(model, seen, *fault, since=since), controller, **options)
 
 
 def turned(seen: Observation, axis: torch.Tensor, angle: float) -> Observation:

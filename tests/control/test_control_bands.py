@@ -8,12 +8,11 @@ import math
 import numpy as np
 import pytest
 import torch
-from obedient_plant import Obedient
+from obedient_plant import untaught
 
-from torch_ekm.control import Bands, ClosedLoop, HandFigures, HandKnowledge, LookAndMoveController, PoseTarget
+from torch_ekm.control import Bands, HandFigures, HandKnowledge, PoseTarget
 from torch_ekm.control.knowledge import STEADY, ModelError
 from torch_ekm.control.rehearsal import lets_go, servo_std
-from torch_ekm.enhanced import EnhancedModel
 
 DEG = math.pi / 180
 F64 = torch.float64
@@ -22,11 +21,9 @@ F64 = torch.float64
 @pytest.fixture(scope="module")
 def path(held):
     """A controller, its knowledge, where it begins, its target, and the first four pieces."""
-    seen, axis, model = held
-    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-    loop = ClosedLoop(Obedient(model, seen), controller)
+    (seen, axis, _), loop = held, untaught(held)
     target = PoseTarget.turned(seen.state, axis, degrees=9)
-    return controller, loop.knowledge, seen, target, loop.plan(target).waypoints[:4]
+    return loop.controller, loop.knowledge, seen, target, loop.plan(target).waypoints[:4]
 
 
 def slopes(figures: HandFigures, lin, action) -> np.ndarray:

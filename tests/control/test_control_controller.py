@@ -216,16 +216,6 @@ def test_joints_stop_before_their_stops(grasp) -> None:
     assert float(state.q[joint] + decision.predicted[joint]) <= stop + 1e-6
 
 
-def test_grip_rows_ask_for_the_missing_force(grasp) -> None:
-    _, _, seen, state = grasp
-    here = PoseTarget(state.position, state.rotation)
-    weak = seen.fingertip_force * 0.5
-    decision = controller(grasp).decide(state, seen.a, here, weak)
-    change = decision.linearization.normal_force_sensitivity @ decision.delta_a
-    thumb = decision.linearization.contacts.finger.index("thumb")
-    assert float(change[thumb]) > 0.3
-
-
 def test_limiting_function_keeps_direction() -> None:
     limiting = LimitingFunction(gain=0.5, step=1.0, contact_travel=2e-3)
     error = torch.tensor([3.0, -4.0])

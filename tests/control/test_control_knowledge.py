@@ -7,19 +7,13 @@ import math
 
 import pytest
 import torch
-from obedient_plant import Obedient
+from obedient_plant import Obedient, untaught
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
-from torch_ekm.control import (
-    ClosedLoop,
-    DescribedFigures,
-    HandKnowledge,
-    LookAndMoveController,
-    PoseTarget,
-)
+from torch_ekm.control import ClosedLoop, DescribedFigures, HandKnowledge, LookAndMoveController, PoseTarget
 from torch_ekm.control.knowledge import ModelError, previous
-from torch_ekm.enhanced import EnhancedModel, ParameterFilter, save
+from torch_ekm.enhanced import ParameterFilter, save
 from torch_ekm.estimation.force_sensitivity import ForceSensitivity
 from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
 from torch_ekm.kinematics import ServoModel
@@ -31,9 +25,7 @@ DEG = math.pi / 180
 
 @pytest.fixture(scope="module")
 def driven(held) -> ClosedLoop:
-    seen, axis, model = held
-    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-    loop = ClosedLoop(Obedient(model, seen), controller)
+    (seen, axis, _), loop = held, untaught(held)
     loop.run(PoseTarget.turned(seen.state, axis, degrees=15))
     return loop
 

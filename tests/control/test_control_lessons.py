@@ -8,7 +8,7 @@ import math
 
 import pytest
 import torch
-from obedient_plant import Obedient
+from obedient_plant import Obedient, untaught
 
 from torch_ekm.control import (
     ClosedLoop,
@@ -135,10 +135,8 @@ def test_a_motion_is_a_path_of_one_piece(held, pieces) -> None:
 
 @pytest.mark.parametrize(("less", "learns"), [(0.3, True), (4.0, False)])
 def test_a_finger_that_slid_or_gave_its_load_away_says_nothing_of_forces(held, less, learns) -> None:
-    seen, axis, model = held
-    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-    loop = ClosedLoop(Obedient(model, seen), controller)
-    target = PoseTarget.turned(seen.state, axis, degrees=5)
+    (seen, axis, _), loop = held, untaught(held)
+    controller, target = loop.controller, PoseTarget.turned(seen.state, axis, degrees=5)
     decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
     expected = controller.expect(decision.pieces, decision.delta_a)
     assert expected.normal is not None
@@ -158,10 +156,8 @@ def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
     shapes = tuple(shape.scaled(0.85) for shape in model.obj.shapes)
     thin = KinematicModel(model.hand, dataclasses.replace(model.obj, shapes=shapes))
     for told, learns, surface in ((thin, True, 0.00225), (thin, False, 0.0), (model, True, 0.0)):
-        controller, known = (
-            LookAndMoveController(EnhancedModel.for_grasp(told, seen.state), axis),
-            HandKnowledge.of(model.hand),
-        )
+        controller = LookAndMoveController(EnhancedModel.for_grasp(told, seen.state), axis)
+        known = HandKnowledge.of(model.hand)
         controller.follow(known.figures, known.forces)
         lessons = Lessons(controller, known, known.figures if learns else DescribedFigures())
         lessons.touch(seen, lambda _: 0.0)  # joints that are off explain it better
@@ -171,11 +167,8 @@ def test_pads_that_press_off_the_surface_say_where_it_is(held) -> None:
         assert followed.surface == pytest.approx(surface, abs=0.0005)
         if surface:
             gaps = followed.contacts(seen.state, seen.fingertip_force).gap
-            assert (
-                float(gaps.abs().max())
-                < 0.0005
-                < float(thin.contacts(seen.state, seen.fingertip_force).gap.min())
-            )
+            described = thin.contacts(seen.state, seen.fingertip_force).gap
+            assert float(gaps.abs().max()) < 0.0005 < float(described.min())
         assert told.surface == 0.0
         lessons.begin(seen)
         assert followed.surface == 0.0

@@ -130,14 +130,8 @@ def test_the_mean_of_looks_decides_what_is_reached(held, looks, reached) -> None
         with pytest.raises(StopIteration) as end:
             next(motions)
         assert end.value.value.reason is StopReason.REACHED
-        assert (
-            abs(
-                loop.controller.focus.error(
-                    PoseTarget(seen.position, seen.rotation), end.value.value.final.state
-                )
-            )
-            < 0.05 * DEG
-        )
+        target = PoseTarget(seen.position, seen.rotation)
+        assert abs(loop.controller.focus.error(target, end.value.value.final.state)) < 0.05 * DEG
     else:
         next(motions)
     assert bool(plant.commands) is not reached

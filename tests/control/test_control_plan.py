@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from obedient_plant import Obedient
+from obedient_plant import Obedient, untaught
 
 from torch_ekm.control import (
     ClosedLoop,
@@ -30,7 +30,6 @@ from torch_ekm.control import (
 from torch_ekm.control.program import LinearizedModel
 from torch_ekm.control.rehearsal import Rehearsal
 from torch_ekm.description import load_object
-from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import StateError
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import SimulatedHand
@@ -41,9 +40,7 @@ DEG = math.pi / 180
 @pytest.fixture(scope="module")
 def loop(held) -> ClosedLoop:
     """With an E-KM of which nothing is known."""
-    seen, axis, model = held
-    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-    return ClosedLoop(Obedient(model, seen), controller)
+    return untaught(held)
 
 
 @pytest.fixture(scope="module")
@@ -235,9 +232,10 @@ def test_a_turn_that_is_given_up_names_what_is_not_safe(held, loop) -> None:
 
 
 def test_two_loops_with_different_knowledge_share_no_controller(held, target) -> None:
-    seen, axis, model = held
-    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-    first, second = (ClosedLoop(Obedient(model, seen), controller) for _ in range(2))
+    seen, _, model = held
+    first = untaught(held)
+    controller = first.controller
+    second = ClosedLoop(Obedient(model, seen), controller)
     assert first.knowledge.figures is second.knowledge.figures  # the second one goes on with them
     other = ClosedLoop(Obedient(model, seen), controller, knowledge=HandKnowledge.of(model.hand))
     for loop in (first, second):

@@ -7,12 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from torch_ekm.control import (
-    Bounds,
-    Equality,
-    Inequality,
-    Squares,
-)
+from torch_ekm.control import Bounds, Equality, Inequality, Squares
 from torch_ekm.control.program import ControlSolution, build_qp
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 
@@ -81,20 +76,18 @@ def test_rows_that_ask_for_nothing() -> None:
 
 
 def test_bad_problem_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"lower\[0\].*upper\[0\] = -1"):
-        build_qp(2, [Bounds(np.array([1.0, 0.0]), np.array([-1.0, 1.0]))])
-    with pytest.raises(NonFiniteError, match="A, b of Equality must be finite"):
-        build_qp(2, [Equality(np.array([[np.nan, 1.0]]), np.array([1.0]))])
-    with pytest.raises(ShapeError, match=r"b of Squares must have shape \(2,\), got \(1,\)"):
-        build_qp(2, [Squares(np.eye(2), np.zeros(1))])
-    with pytest.raises(ShapeError, match="h of Inequality"):
-        build_qp(2, [Inequality(np.eye(2), np.zeros((2, 1)))])
-    with pytest.raises(ShapeError, match=r"upper of Bounds must have shape \(2,\), got \(3,\)"):
-        build_qp(2, [Bounds(np.zeros(2), np.ones(3))])
-    with pytest.raises(ParameterError, match=r"lower of Bounds = \[nan, 0"):
-        build_qp(2, [EFFORT, Bounds(np.array([np.nan, 0.0]), np.ones(2))])
-    with pytest.raises(ParameterError, match="unit of Squares"):
-        build_qp(2, [Squares(np.eye(2), np.zeros(2), unit=0.0)])
+    eye, zero, one = np.eye(2), np.zeros(2), np.ones(2)
+    for row, error, said in (
+        (Bounds(np.array([1.0, 0.0]), np.array([-1.0, 1.0])), ParameterError, r"lower\[0\].*upper\[0\] = -1"),
+        (Equality(np.array([[np.nan, 1.0]]), one[:1]), NonFiniteError, "A, b of Equality must be finite"),
+        (Squares(eye, zero[:1]), ShapeError, r"b of Squares must have shape \(2,\), got \(1,\)"),
+        (Inequality(eye, np.zeros((2, 1))), ShapeError, "h of Inequality"),
+        (Bounds(zero, np.ones(3)), ShapeError, r"upper of Bounds must have shape \(2,\), got \(3,\)"),
+        (Bounds(np.array([np.nan, 0.0]), one), ParameterError, r"lower of Bounds = \[nan, 0"),
+        (Squares(eye, zero, unit=0.0), ParameterError, "unit of Squares"),
+    ):
+        with pytest.raises(error, match=said):
+            build_qp(2, [row])
 
 
 def test_without_slack_the_active_set_finds_what_piqp_finds() -> None:

@@ -96,14 +96,6 @@ def test_a_turn_ends_where_the_model_said(grasp) -> None:
     assert "index_2" in str(other)
 
 
-def test_what_lies_within_reach_ends_by_nothing(grasp) -> None:
-    plant, _, controller = grasp
-    plant.reset(0)
-    reach = ClosedLoop(plant, controller).reach(limit=5 * DEG)
-    assert reach.end.kind is PathEnd.NOTHING
-    assert reach.angle == pytest.approx(5 * DEG, abs=0.3 * DEG)
-
-
 def test_forces_answer_as_they_were_learned_to(grasp) -> None:
     plant, _, controller = grasp
     seen = plant.reset(0)

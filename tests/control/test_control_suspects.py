@@ -7,21 +7,11 @@ import math
 
 import pytest
 import torch
-from obedient_plant import Fault, Obedient
+from obedient_plant import Fault, Obedient, one_more, untaught
 
-from torch_ekm.control import (
-    ClosedLoop,
-    Guards,
-    HandKnowledge,
-    LookAndMoveController,
-    Manipulation,
-    PoseTarget,
-    Safety,
-    StoppingRule,
-)
+from torch_ekm.control import Guards, HandKnowledge, Manipulation, PoseTarget, Safety, StoppingRule
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.watch import Watch
-from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.plant import Observation
 
 DEG = math.pi / 180
@@ -32,25 +22,14 @@ def watch_of(model) -> Watch:
 
 
 def run(held, fault: Fault, since: int) -> Manipulation:
-    seen, axis, model = held
-    controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-    safety = Safety(rule=StoppingRule(max_steps=25))
-    loop = ClosedLoop(Obedient(model, seen, fault, since=since), controller, safety=safety)
+    seen, axis, _ = held
+    loop = untaught(held, fault, since=since, safety=Safety(rule=StoppingRule(max_steps=25)))
     return loop.run(PoseTarget.turned(seen.state, axis, degrees=12))
 
 
-def more(field: str, place: int, size: float) -> Fault:
-    def change(plant: Obedient, seen: Observation) -> Observation:
-        value = getattr(seen, field).clone()
-        value[place] += size
-        return dataclasses.replace(seen, **{field: value})
-
-    return change
-
-
 OFF = {  # 8 mm, 17 deg: less than what is called a jump
-    "pose": (more("position", 0, 0.008), "the object went along x", "fingertips press ("),
-    "joint": (more("q", 6, -17 * DEG), "joint 'index_2' turned", "fingertips press (index)"),
+    "pose": (one_more("position", 0, 0.008), "the object went along x", "fingertips press ("),
+    "joint": (one_more("q", 6, -17 * DEG), "joint 'index_2' turned", "fingertips press (index)"),
 }  # fmt: skip
 
 
@@ -89,8 +68,7 @@ def test_fingertips_that_read_too_little_are_told_until_they_are_known_to(held) 
         def scaled(plant: Obedient, seen: Observation) -> Observation:
             return dataclasses.replace(seen, fingertip_force=scale * seen.fingertip_force)
 
-        controller = LookAndMoveController(EnhancedModel.for_grasp(model, seen.state), axis)
-        loop = ClosedLoop(Obedient(model, seen, scaled, since=0), controller, knowledge=knowledge)
+        loop = untaught(held, scaled, since=0, knowledge=knowledge)
         return loop.run(PoseTarget.turned(seen.state, axis, degrees=8))
 
     known, told = [], []

@@ -19,7 +19,7 @@ from wirings import DEG, T42, radians, write
 
 pytest.importorskip("dynamixel_sdk")
 
-from dynamixel_bus import REGISTERS, DynamixelBus
+from dynamixel_bus import DynamixelBus
 from motors import Motors
 from spoiling import Spoiler
 
@@ -406,18 +406,3 @@ def test_a_servo_that_reboots_in_a_motion_ends_it(tmp_path) -> None:
         threading.Timer(0.1, bus.reboot, [2]).start()
         with pytest.raises(BusError, match=r"'right': its clock .* has rebooted|torque is off"):
             plant.command(radians(0.3, 0.3))
-
-
-REFUSED = [  # before torque, register, value, error of protocol 2
-    (1, "mode", 4, 7), (0, "mode", 7, 4), (0, "mode", 0, 0), (1, "current", 1194, 6), (1, "position", 5, 7),
-    (1, "goal", 1048576, 6), (1, "profile", 32768, 4), (1, "torque", 2, 4), (1, "homing", 1, 7),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("torque", "name", "value", "error"), REFUSED)
-def test_the_emulated_bus_refuses_what_a_servo_refuses(torque, name, value, error) -> None:
-    with servos() as bus:
-        bus.set(1, "mode", 5)
-        bus.set(1, "torque", torque)
-        address, size = REGISTERS[name]
-        assert bus._write(address, {1: value.to_bytes(size, "little")}).get(1, 0) == error

@@ -19,12 +19,7 @@ from torch_ekm.exceptions import (
 )
 from torch_ekm.kinematics.grasp_state import GraspState
 from torch_ekm.kinematics.se3 import exp
-from torch_ekm.residual import (
-    MixtureResidual,
-    RecursiveLeastSquares,
-    ReplayMLP,
-    SparseOnlineGP,
-)
+from torch_ekm.residual import MixtureResidual, RecursiveLeastSquares, ReplayMLP, SparseOnlineGP
 
 N_S, N_A = 3, 2
 

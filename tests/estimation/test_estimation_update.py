@@ -18,7 +18,6 @@ from torch_ekm.exceptions import (
     ShapeError,
     StateMismatchError,
 )
-from torch_ekm.inspection.health import _Watch
 from torch_ekm.residual import RecursiveLeastSquares
 
 BATCH, N, M = 5, 4, 3
@@ -121,18 +120,6 @@ def test_forces_are_learned_by_least_squares_with_directional_forgetting(draw) -
         np.testing.assert_allclose(learner.theta, theta, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(learner.evidence, D, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(learner.variance, s2, rtol=1e-12)
-
-
-def test_health_is_learned_by_recursive_least_squares(draw) -> None:
-    watch = _Watch("servo")
-    theta, P = watch.theta, watch.P
-    for _ in range(30):
-        x, y = np.array([1.0, draw.choice([-1.0, 1.0])]), 0.01 * draw.normal()
-        watch.learn(x, y)
-        Px = P @ x
-        theta, P = theta + Px * (y - theta @ x) / (1 + x @ Px), P - np.outer(Px, Px) / (1 + x @ Px)
-        np.testing.assert_allclose(watch.theta, theta, rtol=1e-12, atol=1e-15)
-        np.testing.assert_allclose(watch.P, P, rtol=1e-11, atol=1e-12)
 
 
 NAN = math.nan

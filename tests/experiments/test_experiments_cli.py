@@ -90,10 +90,6 @@ def test_a_table_that_is_too_wide_is_printed_in_parts(
     assert max(map(len, printed.splitlines())) <= width
 
 
-def test_some_help_has_units_in_brackets() -> None:
-    assert "[deg]" in CliRunner().invoke(app, ["reproduce", "--help"]).output
-
-
 def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     shown = CliRunner().invoke(app, ["objects"])
     assert "mass [g]" in shown.output

@@ -12,15 +12,11 @@ import pytest
 import torch
 
 from torch_ekm._terminal import print_report
-from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
+from torch_ekm.exceptions import ParameterError, ShapeError
 from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.report import ComparisonReport, overview_table, score_table
 from torch_ekm.experiments.learner_comparison.run import run_one
-from torch_ekm.experiments.learner_comparison.scores import (
-    Comparison,
-    Score,
-    block_bootstrap,
-)
+from torch_ekm.experiments.learner_comparison.scores import Comparison, Score, block_bootstrap
 from torch_ekm.experiments.learner_comparison.stream import Stream
 from torch_ekm.experiments.learners import COMPARED, LEARNERS, learner_factory
 from torch_ekm.experiments.reporting.report import Report, Table
@@ -132,16 +128,9 @@ def test_what_is_finished_is_not_run_again(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_compared() -> None:
-    with pytest.raises(UnknownNameError, match="linear RLS"):
-        compare(linear(60), ("best of all",))
-    with pytest.raises(ParameterError, match="different names"):
-        compare([linear(60), linear(60)], ("linear RLS",))
-    with pytest.raises(ParameterError, match="at least one"):
-        compare([], ("linear RLS",))
-    with pytest.raises(ParameterError, match="at least one"):
-        compare(linear(60), {})
-    with pytest.raises(ShapeError, match="too short"):
-        compare(linear(30), ("linear RLS",))
+    for streams, learners in (([], ("linear RLS",)), (linear(60), {})):
+        with pytest.raises(ParameterError, match="at least one"):
+            compare(streams, learners)
     with pytest.raises(ShapeError, match="one input for each output"):
         Stream("uneven", torch.zeros(50, 2), torch.zeros(49, 1))
 

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 from made_up_sessions import made_up_turn
-from typer.testing import CliRunner
 
-from torch_ekm.cli import app
 from torch_ekm.control import Safety, StoppingRule
 from torch_ekm.exceptions import UnknownNameError
 from torch_ekm.experiments.config import Setting
@@ -100,17 +98,6 @@ def test_a_finished_demo_is_not_run_again(
     assert {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*.json")} == before
 
 
-@pytest.mark.usefixtures("planned_anew")
-def test_the_demo_is_a_preset_of_generalize_and_repeats_itself(records: list[TrialRecord]) -> None:
-    """The same grasps, hardware and options: the first turn of an E-KM that had no warm-up."""
-    generalize = dataclasses.replace(EXPERIMENT.protocol, angles_deg=(9.0,))
-    (turn,) = generalize.session("box", "E-KM", 1)
-    ours = next(r for r in records if (r.controller, r.seed, r.trial) == ("E-KM", 1, 0))
-    assert turn.errors_deg == ours.errors_deg
-    assert list(turn.poses) == list(ours.poses)
-    assert len(turn.poses) == turn.steps + 1
-
-
 def test_the_first_hand_turns_objects_that_it_has_never_held() -> None:
     jobs = Demo(BRIEF, new=("box", "can")).jobs((3, 4))
     new = {name: job for name, job in jobs.items() if name.startswith("new_")}
@@ -144,12 +131,7 @@ def test_results_are_named_by_the_model_that_is_run() -> None:
 def test_wrong_names_list_the_right_ones() -> None:
     with pytest.raises(UnknownNameError, match="weighted_box"):
         Demo(objects=("spoon",))
+    with pytest.raises(UnknownNameError, match="KM\\+I"):
+        Demo(controllers=("PID",))
     with pytest.raises(UnknownNameError, match="E-KM"):
         EXPERIMENT.protocol.session("box", "PID", 0)
-
-
-@pytest.mark.parametrize("command", [["--help"], ["demo", "--help"], ["hands"], ["objects"], ["version"]])
-def test_command_line_explains_itself(command: list[str]) -> None:
-    result = CliRunner().invoke(app, command)
-    assert result.exit_code == 0, result.output
-    assert len(result.output) > 50

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -72,14 +70,6 @@ def test_an_own_learner_is_run_anew_when_it_changes(tmp_path: Path) -> None:
     assert run(Damped)[1] == 4  # its code
     assert compare(stream(), {"other": Damped}, folder=tmp_path)
     assert len(list(tmp_path.glob("*.json"))) == 5
-
-
-def test_importing_experiments_is_cheap() -> None:
-    code = "import sys, torch_ekm.experiments; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    brought = set(done.stdout.split())
-    assert "torch_ekm.experiments" in brought
-    assert not {"sapien", "cv2", "matplotlib", "pyvista", "joblib", "scipy"} & brought
 
 
 def test_what_makes_no_learner_is_refused_by_name_before_anything_runs(tmp_path: Path) -> None:

@@ -106,9 +106,9 @@ def test_without_touch_the_prediction_is_all_there_is(turned) -> None:
 
 
 def test_the_stated_uncertainty_holds(turned) -> None:
-    """Whitened errors of 15 noisy readings: neither too small a covariance nor far too large a one."""
+    """Whitened errors of 8 noisy readings: neither too small a covariance nor far too large a one."""
     chi2, stds = [], []
-    for seed in range(15):
+    for seed in range(8):
         plant, seen = blind(turned, seed)
         error, P = missed(plant, seen[-1]), plant.filter.pose_covariance
         chi2.append(float(error @ torch.linalg.solve(P, error)) / 6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 import sys
 import time
 from collections.abc import Sequence
@@ -16,9 +17,6 @@ import torch
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("typer")
 
-import re
-
-import pytest
 from dynamixel_bus import DynamixelBus
 from motors import Motors
 from typer.testing import CliRunner
@@ -194,9 +192,6 @@ def test_a_motor_that_stands_still_is_named(bus, tmp_path) -> None:
             identify_servo(plant)
         with pytest.raises(DeviceError, match=r"motor 'left': does not move, and its load does not rise"):
             find_slack(plant)
-
-
-pytest.importorskip("typer", reason="extra 'plots'")
 
 
 PAGES = Path(__file__).parents[2] / "docs" / "how_to"

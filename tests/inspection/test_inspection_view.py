@@ -13,13 +13,7 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.description import load_hand
-from torch_ekm.exceptions import (
-    DescriptionError,
-    OutputError,
-    ParameterError,
-    ShapeError,
-    UnknownNameError,
-)
+from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.inspection.view import view, view_hand, view_log
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
 from torch_ekm.rendering import Captions, save_animation
@@ -150,22 +144,21 @@ def test_what_cannot_be_shown_is_named(folder, tmp_path) -> None:
         view("nonsense")
     with pytest.raises(ParameterError, match="left out with a log"):
         view(str(folder), object="box")
-    with pytest.raises(DescriptionError, match="nothing to show: not grasped"):
-        view_log(folder, trial=2)
-    with pytest.raises(DescriptionError, match="no trial 7; there are 0, 1, 2"):
-        view_log(folder, trial=7)
-    with pytest.raises(DescriptionError, match="no such log"):
-        view_log(tmp_path / "none")
-    with pytest.raises(DescriptionError, match="name its folder"):
-        view_log(folder / "trial_000001.h5", trial=1)
+    for path, trial, said in (
+        (folder, 2, "nothing to show: not grasped"),
+        (folder, 7, "no trial 7; there are 0, 1, 2"),
+        (tmp_path / "none", None, "no such log"),
+        (folder / "trial_000001.h5", 1, "name its folder"),
+    ):
+        with pytest.raises(DescriptionError, match=said):
+            view_log(path, trial=trial)
     recording = TrialLog.open(folder).read(0)
     for configuration, match in (
         ({"hand": "icub_right"}, "no object"),
         ({"hand": "icub_right", "object": "box"}, "4 joints"),
     ):
-        path = Trajectory(
-            0, recording.commands, recording.observations, {"configuration": configuration}
-        ).save(tmp_path / "trial.h5")
+        log = Trajectory(0, recording.commands, recording.observations, {"configuration": configuration})
+        path = log.save(tmp_path / "trial.h5")
         with pytest.raises(DescriptionError, match=match):
             view_log(path)
 

@@ -116,7 +116,6 @@ def test_a_first_target_that_is_skipped_is_not_the_offset() -> None:
     assert regressor.predict(np.zeros((1, 1)))[0][0, 0] == pytest.approx(5.0)
 
 
-pytest.importorskip("river", reason="extra 'interop'")
 public_streams = pytest.importorskip(
     "public_streams", reason="the benchmarks are not part of this installation"
 )

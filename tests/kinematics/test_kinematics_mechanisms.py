@@ -17,7 +17,7 @@ from torch_ekm.kinematics import ActuationMap
 
 mujoco = pytest.importorskip("mujoco")
 
-SHARES = (0.15, 0.5, 0.85)  # of the motors' ranges
+SHARES = (0.15, 0.85)  # of the motors' ranges
 
 
 def hand_of(name: str, folder: Path) -> HandDescription:

@@ -46,8 +46,7 @@ def test_an_object_of_2_kg_described_as_80_g_shows_in_the_joint_torques():
 
 def test_the_friction_limit_names_the_pad_and_worse_doubts_come_first(toy):
     slippery = toy.contacts.replace(
-        friction=torch.full((3,), 0.36, dtype=F64),
-        near_misses=(NearMiss("f1_l0", None, -0.0002),),
+        friction=torch.full((3,), 0.36, dtype=F64), near_misses=(NearMiss("f1_l0", None, -0.0002),)
     )
     lin = toy.model.linearize(toy.state, slippery)
     assert float(lin.forces.relative_margin.min()) < 0.01

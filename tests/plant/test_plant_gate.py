@@ -254,10 +254,12 @@ def test_other_kinds_of_numbers_are_taken() -> None:
     plant = Hand()
     unknown = {"estimate": {"pose_covariance": np.full((6, 6), math.nan)}}
     plant.change = lambda seen: dataclasses.replace(
-        seen, a=torch.tensor([1, 2, 3]), position=torch.zeros(3), time=np.float32(2.0), info=unknown
-    )
+        seen, q=torch.zeros(3), a=torch.tensor([1, 2, 3]), position=torch.zeros(3), rotation=torch.eye(3),
+        fingertip_force=torch.ones(3), time=np.float32(2.0), info=unknown,
+    )  # fmt: skip
     seen = Gate(plant, HAND).observe()
-    assert {one.dtype for one in (seen.a, seen.position)} == {torch.float64}
+    parts = seen.q, seen.a, seen.position, seen.rotation, seen.fingertip_force
+    assert {one.dtype for one in parts} == {torch.float64}
     assert seen.time == 2.0
     assert seen.status is PlantStatus.HELD
     assert seen.info["estimate"]["pose_covariance"].shape == (6, 6)

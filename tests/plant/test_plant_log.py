@@ -129,10 +129,9 @@ def test_what_is_no_log_of_this_run_is_refused(unbroken: Path, tmp_path: Path) -
         TrialLog(unbroken, {**CONFIGURATION, "gain": 0.7})
     with pytest.raises(ParameterError, match="about"):
         TrialLog(tmp_path / "new", {"hand": object()})
-    with pytest.raises(DescriptionError, match="no such log"):
-        TrialLog.open(tmp_path / "nothing")
-    with pytest.raises(DescriptionError, match="trial_000000"):
-        TrialLog.open(tmp_path)
+    for folder, said in ((tmp_path / "nothing", "no such log"), (tmp_path, "trial_000000")):
+        with pytest.raises(DescriptionError, match=said):
+            TrialLog.open(folder)
     (tmp_path / "file").touch()
     with pytest.raises(DescriptionError, match="is a file"):
         TrialLog(tmp_path / "file", {})
@@ -146,10 +145,9 @@ def test_what_is_no_log_of_this_run_is_refused(unbroken: Path, tmp_path: Path) -
     with pytest.raises(StateError, match="closed, or opened to be read"):
         log.write(9, Trajectory())
     with TrialLog(unbroken, CONFIGURATION) as log:
-        with pytest.raises(ParameterError, match="not in the log yet"):
-            log.write(3, Trajectory())
-        with pytest.raises(ParameterError, match="trial"):
-            log.write(-1, Trajectory())
+        for trial, said in ((3, "not in the log yet"), (-1, "trial")):
+            with pytest.raises(ParameterError, match=said):
+                log.write(trial, Trajectory())
     assert contents(unbroken) == before
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-import pytest
-
 import torch_ekm
 
 PACKAGE = Path(torch_ekm.__file__).parent
@@ -43,19 +41,3 @@ def test_nothing_that_controls_senses_or_learns_reads_the_truth() -> None:
     assert readers == {"plant/__init__.py"}  # exports the type
     for place in MAY:  # what may read it does: the test finds what it looks for
         assert any(lines for name, lines in found.items() if name.startswith(place)), place
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "error = target.error(seen.truth.state)",
-        'position = getattr(seen, "truth").position',
-        'position = vars(seen)["truth"].position',
-        "from ..plant import Observation, Truth",
-        "told = plant.Truth(q, p, R)",
-        "blind = replace(seen, truth=None)",
-    ],
-)
-def test_a_reader_is_found(line: str) -> None:
-    assert mentions(line) == [1]
-    assert mentions('"""The truth is not read here."""\nseen.state  # truth') == []

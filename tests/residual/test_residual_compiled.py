@@ -130,9 +130,8 @@ KERNELS = {
 
 
 @numba_here
-@pytest.mark.parametrize("shape", [(), (3,)])
+@pytest.mark.parametrize(("shape", "memory"), [((), 60), ((3,), 0), ((3,), 60)])
 @pytest.mark.parametrize("name", KERNELS)
-@pytest.mark.parametrize("memory", [0, 60])
 def test_compiled_steps_and_rebuilds_are_those_of_torch(name, shape, memory):
     """Hyperparameters take the same way, in parts (one model with a memory) and at once."""
     x, y = hard_stream(130, *shape)
@@ -145,7 +144,7 @@ def test_compiled_steps_and_rebuilds_are_those_of_torch(name, shape, memory):
     for t in range(len(x)):
         fast.update(x[t], y[t])
         copied.update(x[t], y[t])
-        copied = copy.deepcopy(copied)  # between the parts of a step, too
+        copied = copied if t % 3 else copy.deepcopy(copied)  # between the parts of a step, too
     for a, b, c in zip(*(one.buffers() for one in (reference, fast, copied)), strict=True):
         torch.testing.assert_close(b, a, atol=1e-5, rtol=1e-5)
         assert torch.equal(b, c)

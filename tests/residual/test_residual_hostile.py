@@ -6,11 +6,11 @@ import copy
 
 import pytest
 import torch
+from as_published import share_left
 from hostile_streams import EVENTS, LEARNERS, Hostile, judge
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from torch_ekm.exceptions import ParameterError
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernel,
@@ -52,16 +52,6 @@ def test_no_stream_makes_it_say_nonsense(name, hostile):
     assert verdict.ratio <= 3.0, hostile
 
 
-@EVERY
-@pytest.mark.parametrize("jitter", [1e-12, 1e-6])
-def test_an_input_that_stood_still_begins_to_move(name, jitter):
-    """Without bounds 1e10 and 1e4 times y with a linear kernel, and NaN for good."""
-    stream = Hostile(0, 80, 1.0, 1.0, 0.0, jitter, ("input stands still",))
-    verdict = judge(LEARNERS[name](20), *stream.samples())
-    assert verdict.not_finite == 0
-    assert verdict.ratio <= 2.0
-
-
 @pytest.mark.parametrize(
     "make",
     [SparseOnlineGP, RecursiveLeastSquares, RandomFeatureRLS, ReplayMLP, default_learner],
@@ -73,11 +63,7 @@ def test_where_y_shrinks_by_a_thousand_what_was_learned_is_let_go(make):
     y[100:] *= 1e-3
     learner = make(4, 2)
     learner.update(x[:140], y[:140])
-    errors = []
-    for x_t, y_t in zip(x[140:], y[140:], strict=True):
-        errors.append(learner(x_t) - y_t)
-        learner.update(x_t, y_t)
-    assert float(torch.stack(errors).square().mean().sqrt() / y[140:].square().mean().sqrt()) < 1.2
+    assert share_left(learner, x[140:], y[140:]) < 1.2
 
 
 def test_models_of_a_fleet_let_go_one_by_one():
@@ -223,13 +209,6 @@ def test_an_output_below_its_scale_is_noise_of_that_scale():
         assert float(made.predict(x[0], observation=True).stddev.min()) > 1e-5
 
 
-@pytest.mark.parametrize("bad", [-1.0, float("nan"), [1.0, 2.0], "a", [1.0, None, 1.0, 1.0]])
-@pytest.mark.usefixtures("unchecked")
-def test_a_scale_that_is_none_is_refused(bad):
-    with pytest.raises(ParameterError, match="input_resolution"):
-        default_learner(4, 2, input_resolution=bad)
-
-
 @EVERY
 def test_bounds_are_part_of_the_state(name):
     x, y = Hostile(0, 30, 1.0, 1.0, 0.0, 0.0, ()).samples()
@@ -261,13 +240,15 @@ def test_compiled_loops_cut_where_torch_does(kernel):
 
 
 @pytest.mark.parametrize("engine", ["compiled", "torch"])
-def test_a_point_without_effect_makes_no_basis_vector(engine):
-    """Its variance is that of an action of 1e-17, whose inverse would multiply what comes."""
+@pytest.mark.parametrize("action", [0.0, 1e-17])
+def test_a_point_without_effect_makes_no_basis_vector(engine, action):
+    """The inverse of its variance, of 1e-34, would multiply what comes."""
     gp = SparseOnlineGP(2, 1, kernel=ActionLinearKernel(2, 1), parts=(), standardize=False)
     if engine == "torch":
         gp.engine = None
     one = torch.ones(1, dtype=torch.float64)
-    gp.update(torch.tensor([0.3, 1e-17], dtype=torch.float64), one)
+    update = gp.update(torch.tensor([0.3, action], dtype=torch.float64), one)
+    assert action or not update.novelty
     gp.update(torch.tensor([0.2, 1.0], dtype=torch.float64), one)
     assert int(gp.posterior.count) == 1
     assert float(gp.posterior.moments.abs().max()) < 1e3

@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 import torch
-from as_published import sogp
+from as_published import in_turn, sogp
 from torch.distributions import StudentT
 
-from torch_ekm.exceptions import ParameterError
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.residual import (
     LearnHyperparameters,
@@ -43,15 +42,6 @@ def linear(**options):
     return RecursiveLeastSquares(2, 1, noise_variance=0.1, **options)
 
 
-def in_turn(learner, x, y):
-    """Errors of predictions that come before learning; a fleet takes all its streams at once."""
-    errors = []
-    for x_t, y_t in zip(x, y, strict=True):
-        errors.append(y_t - learner(x_t))
-        learner.update(x_t, y_t)
-    return torch.stack(errors)
-
-
 def side_by_side(streams):
     """Streams ``(n, d)`` as those of a fleet ``(n, streams, d)``."""
     return [torch.stack(part, dim=1) for part in zip(*streams, strict=True)]
@@ -69,15 +59,6 @@ def test_carry_reaches_the_kalman_filters_error():
         best = math.sqrt((2 * pose**2 + motion**2) / (1 + kappa**2))
         assert error < 1.05 * best
         assert found == pytest.approx(kappa, abs=0.15)
-
-
-def test_carry_is_worth_it_and_costs_nothing_where_there_is_none():
-    x, y = side_by_side([noisy_pose(1, 1000, pose) for pose in (0.3, 0.0)])
-    learners = MixtureResidual(linear(batch_shape=(2,))), linear(batch_shape=(2,))
-    mixed, plain = (in_turn(one, x, y)[300:].square().mean(0).sqrt().flatten() for one in learners)
-    with_noise, without = (mixed / plain).tolist()
-    assert with_noise < 0.85
-    assert without < 1.02
 
 
 def test_what_cannot_be_learned_costs_next_to_nothing():
@@ -139,23 +120,6 @@ def test_predictive_law_is_better_than_normal_on_heavy_tails_and_no_worse_on_lig
         assert mine < best + 0.06
 
 
-def test_intervals_cover():
-    torch.manual_seed(6)
-    x = torch.randn(1000, 2, dtype=torch.float64)
-    y = torch.cat([0.1 * torch.randn(1000, 1), 5.0 * torch.randn(1000, 1)], 1).double()
-    run = run_prequential(MixtureResidual(ZeroResidual(2, 2)), x, y)
-    assert float((run.coverage(200) - 0.9).abs().max()) < 0.03
-
-
-def test_new_sequence_carries_nothing_over():
-    x, y = noisy_pose(7, 300, 0.3)
-    mixture = MixtureResidual(linear(), levels=(0.0,))
-    mixture.update(x, y)
-    assert float(mixture.offset.abs()) > 0.01
-    mixture.new_sequence()
-    assert float(mixture.offset.abs()) == 0.0
-
-
 def test_a_fleet_is_so_many_single_mixtures():
     n = 96
     x, y = noisy_pose(8, n, 0.3)
@@ -177,29 +141,6 @@ def test_a_fleet_is_so_many_single_mixtures():
         torch.testing.assert_close(single(x[:5, i]), fleet(x[:5])[:, i], atol=1e-10, rtol=0)
         law, laws = single.predictive(x[:5, i]), fleet.predictive(x[:5])
         torch.testing.assert_close(law.log_prob(y[:5, i]), laws.log_prob(y[:5])[:, i], atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"levels": ()},
-        {"levels": (1.5,)},
-        {"levels": (-0.1,)},
-        {"trends": (2.0,)},
-        {"doubts": (1.0, 1.0)},
-        {"doubts": (-1.0,)},
-    ],
-)
-def test_wrong_choices_are_named(options):
-    with pytest.raises(ParameterError, match=next(iter(options))):
-        MixtureResidual(linear(), **options)
-
-
-def test_learners_must_fit_together():
-    with pytest.raises(ParameterError, match="learners"):
-        MixtureResidual([])
-    with pytest.raises(ParameterError, match="same"):
-        MixtureResidual([ZeroResidual(2, 1), ZeroResidual(2, 2)])
 
 
 def test_at_first_a_learner_is_taken_at_its_word():

@@ -301,26 +301,6 @@ def test_what_does_not_go_together_is_told(parts, message):
             kind(3, 2, parts=parts)
 
 
-@pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize(
-    ("kind", "arguments", "name"),
-    [
-        (ForgettingFactor, {"factor": 0.0}, "factor"),
-        (ForgettingFactor, {"factor": 1.1}, "factor"),
-        (ProcessNoise, {"share": 1.0}, "share"),
-        (ProcessNoise, {"share": -0.1}, "share"),
-        (RobustWeight, {"threshold": 0.0}, "threshold"),
-        (LearnHyperparameters, {"rate": -1.0}, "rate"),
-        (LearnHyperparameters, {"steps": 0}, "steps"),
-        (LearnHyperparameters, {"memory": -1}, "memory"),
-        (LearnHyperparameters, {"memory": "many"}, "memory"),
-    ],
-)
-def test_figures_that_cannot_be_are_named(kind, arguments, name):
-    with pytest.raises(ParameterError, match=name):
-        kind(**arguments)
-
-
 def test_a_learner_tells_its_parts():
     text = repr(learner(PARTS["all"]))
     for told in ("RobustWeight(threshold=3.0)", "ForgettingFactor(factor=0.98)", "memory=15"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import threading
 
 import pytest
@@ -101,15 +100,6 @@ def test_it_may_be_left_out_in_a_fleet():
     fleets[0].update(x, x[..., :1])
     fleets[1].update(x, x[..., 0])
     assert torch.equal(fleets[0](x), fleets[1](x))
-
-
-def test_a_pickled_learner_goes_on_as_the_learner_does():
-    learner, x = learned(default_learner)
-    other = pickle.loads(pickle.dumps(learner))
-    assert other.lock is not learner.lock
-    for one in (learner, other):
-        one.update(x[:5], x[:5, :1])
-    assert torch.equal(other(x), learner(x))
 
 
 @pytest.mark.parametrize(

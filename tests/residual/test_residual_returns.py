@@ -6,8 +6,9 @@ import copy
 
 import pytest
 import torch
+from as_published import share_left as left
 
-from torch_ekm.residual import MixtureResidual, ResidualLearner, SparseOnlineGP, default_learner
+from torch_ekm.residual import MixtureResidual, SparseOnlineGP, default_learner
 
 
 def there_and_back(seed: int, n: tuple[int, int, int] = (300, 200, 50)) -> tuple[torch.Tensor, torch.Tensor]:
@@ -19,15 +20,6 @@ def there_and_back(seed: int, n: tuple[int, int, int] = (300, 200, 50)) -> tuple
     between[n[0] : n[0] + n[1]] = True
     y = torch.where(between, x @ second, x @ first)
     return x, y + 0.05 * torch.randn(sum(n), 2, generator=g, dtype=torch.float64)
-
-
-def left(learner: ResidualLearner, x: torch.Tensor, y: torch.Tensor) -> float:
-    """Error over that of the model alone."""
-    errors = []
-    for x_t, y_t in zip(x, y, strict=True):
-        errors.append(y_t - learner(x_t))
-        learner.update(x_t, y_t)
-    return float((torch.stack(errors).square().mean() / y.square().mean()).sqrt())
 
 
 @pytest.mark.parametrize("seed", [1, 2])

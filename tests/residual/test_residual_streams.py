@@ -12,7 +12,6 @@ import score_learners
 import torch
 from as_published import sogp
 
-from torch_ekm.exceptions import DescriptionError
 from torch_ekm.experiments import compare
 from torch_ekm.experiments.learner_comparison.prequential import Prequential, run_prequential
 from torch_ekm.experiments.learner_comparison.recordings import load_t42
@@ -22,12 +21,6 @@ DATA = os.environ.get("TORCH_EKM_DATA", "")
 needs_data = pytest.mark.skipif(
     not Path(DATA).is_dir() or not DATA, reason="TORCH_EKM_DATA names no folder with the recordings"
 )
-
-
-def test_missing_folder_is_told(monkeypatch):
-    monkeypatch.delenv("TORCH_EKM_DATA", raising=False)
-    with pytest.raises(DescriptionError, match="TORCH_EKM_DATA"):
-        load_t42()
 
 
 def test_scores_by_hand():

@@ -9,14 +9,7 @@ from simulation_helpers import DEG, ROLL, SQUEEZE, increment, motion, truth, tur
 
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.plant import Plant, PlantStatus
-from torch_ekm.simulation import (
-    PRESETS,
-    DisturbedPlant,
-    PlantChange,
-    PlantParameters,
-    SimulatedHand,
-    Tug,
-)
+from torch_ekm.simulation import PRESETS, DisturbedPlant, PlantChange, PlantParameters, SimulatedHand, Tug
 
 pytest.importorskip("sapien")
 

@@ -88,15 +88,3 @@ def test_what_is_not_a_recording_is_refused(tmp_path):
     assert not list(tmp_path.glob("never*"))
     with pytest.raises(StateError, match="the trajectory is empty"):
         ReplayedPlant(Trajectory())
-
-
-def test_any_flipped_byte_is_noticed(tmp_path):
-    """Of data, description, and of the space that HDF5 leaves unused."""
-    path = record().save(tmp_path / "run.h5")
-    whole = path.read_bytes()
-    for place in range(0, len(whole), 97):
-        damaged = bytearray(whole)
-        damaged[place] ^= 0x55
-        path.write_bytes(damaged)
-        with pytest.raises(DescriptionError, match="damaged"):
-            Trajectory.load(path)

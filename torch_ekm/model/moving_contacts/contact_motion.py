@@ -319,7 +319,8 @@ class ContactMotion:
 
     def _leaps(self, z: Array) -> bool:
         """An increment of a substep leads to another equilibrium than the motion."""
-        return self._farthest(z) > _FARTHEST or float(np.abs(z[-6:]).max()) > _LEAP
+        turned = z[self._laws.joints.shape[1] :]
+        return self._farthest(z) > _FARTHEST or float(np.abs(turned).max()) > _LEAP
 
     def _report(
         self, before: GraspState, names: tuple[str, ...], last: _Substep, slid: dict[str, float]
