@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from .._checks import check_finite, check_kind, check_shape
+from .._checks import check_count, check_finite, check_kind, check_shape
 from .._recorded import check_state
 from ..exceptions import FileFormatError, OutputError, ResumeError
 from ..kinematics.tensors import as_tensors
@@ -35,6 +35,7 @@ class _Turn(NamedTuple):
     """Where the motors stood [rad]."""
     pose: PoseTarget | None
     """Where the object was; None: it was not seen."""
+    motions: int
     reason: str
     """Why the turn ended; "": it has not."""
 
@@ -82,16 +83,18 @@ class Journal:
         if os.path.exists(self.path):
             self._read()
         self._left = None
-        self._write(loop, target, loop.plant.observe())
+        self._write(loop, target, loop.plant.observe(), 0)
         with contextlib.closing(loop.steps(target)) as motions:
+            k = 0
             while True:
                 try:
                     step = next(motions)
                 except StopIteration as end:
                     stop: Stop = end.value
-                    self._write(loop, target, stop.final, stop.reason.value)
+                    self._write(loop, target, stop.final, k, stop.reason.value)
                     return stop
-                self._write(loop, target, step.after)
+                k += 1
+                self._write(loop, target, step.after, k)
                 yield step
 
     def resume(self, loop: ClosedLoop) -> Manipulation:
@@ -136,7 +139,9 @@ class Journal:
             return f"the object is {1e3 * shift:.0f} mm and {deg(turn)} from where it was: begin a new turn"
         return ""
 
-    def _write(self, loop: ClosedLoop, target: PoseTarget, seen: Observation, reason: str = "") -> None:
+    def _write(
+        self, loop: ClosedLoop, target: PoseTarget, seen: Observation, motions: int, reason: str = ""
+    ) -> None:
         state = {
             "learned": dict(loop.learned.state_dict()),
             "target": {"position": target.position, "rotation": target.rotation},
@@ -144,6 +149,7 @@ class Journal:
                 "a": seen.a, "position": seen.position, "rotation": seen.rotation,
                 "seen": seen.status is PlantStatus.HELD,
             },
+            "motions": motions,
             "reason": reason,
             "actuators": list(loop.controller.kinematic.hand.actuator_names),
         }  # fmt: skip
@@ -171,8 +177,13 @@ class Journal:
             check_shape("a", a, (len(actuators),))
             check_finite("a", a)
             pose = PoseTarget(seen["position"], seen["rotation"]) if seen["seen"] else None
-            goal, reason = PoseTarget(target["position"], target["rotation"]), state["reason"]
-            return _Turn(learned, goal, actuators, a, pose, check_kind("reason", reason, str))
+            goal, motions = (
+                PoseTarget(target["position"], target["rotation"]),
+                check_count("motions", state["motions"], 0),
+            )
+            return _Turn(
+                learned, goal, actuators, a, pose, motions, check_kind("reason", state["reason"], str)
+            )
         except Exception as error:  # of another version, or of something else
             problem = f"no journal of a turn ({error}): name another file"
             raise FileFormatError(self.path, problem) from None
