@@ -44,6 +44,7 @@ from torch_ekm.control import (
     PoseTarget,
     StopReason,
 )
+from torch_ekm.control.journal import _Turn
 from torch_ekm.description import load_object
 from torch_ekm.drivers import WithPose
 from torch_ekm.enhanced import EnhancedModel
@@ -281,11 +282,11 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
     held.settle()
     written = journal._read()
     if not journal.cut_short:
-        return written["motions"], f"{written['reason']}, before it was killed"
-    return written["motions"], held.apart(lambda: resumed(held, journal, written, seen, learns))
+        return written.motions, f"{written.reason}, before it was killed"
+    return written.motions, held.apart(lambda: resumed(held, journal, written, seen, learns))
 
 
-def resumed(held: Held, journal: Journal, written: dict, seen: Observation, learns: bool) -> str:
+def resumed(held: Held, journal: Journal, written: _Turn, seen: Observation, learns: bool) -> str:
     """How a turn that was killed ends."""
     with held.driven() as plant:
         recorded = Recorded(plant)
@@ -295,8 +296,8 @@ def resumed(held: Held, journal: Journal, written: dict, seen: Observation, lear
             result = journal.resume(loop)
         except EKMError as error:
             return type(error).__name__
-    kept = written["learned"]["knowledge.servo.weight"]
-    assert not (written["motions"] and learns and torch.equal(kept, forgotten)), "nothing was kept"
+    kept = written.learned["knowledge.servo.weight"]
+    assert not (written.motions and learns and torch.equal(kept, forgotten)), "nothing was kept"
     assert recorded.after, "it does not hold"
     assert not bool(recorded.sent[0].any()), "it does not hold first"
     for begins in recorded.before[1:2]:

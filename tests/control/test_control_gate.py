@@ -31,12 +31,14 @@ from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import (
     CommandRefusedError,
     FileFormatError,
+    OutputError,
     PlantInUseError,
     ResumeError,
     StateMismatchError,
 )
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
 from torch_ekm.residual import RecursiveLeastSquares
+from torch_ekm.residual import files as learner_files
 
 DEG = math.pi / 180
 
@@ -327,3 +329,54 @@ def test_a_file_that_is_no_journal_is_refused(held, tmp_path) -> None:
     loop.knowledge.save(tmp_path / "hand.ekm")
     with pytest.raises(FileFormatError, match="no journal"):
         Journal(tmp_path / "hand.ekm").resume(loop)
+
+
+def edited(path: Path, change) -> None:
+    """As another version of the package would have written the journal."""
+    described, state = learner_files.read(path)
+    change(described, state)
+    learner_files.write(path, described, state)
+
+
+OTHERS = {
+    "no actuators": lambda described, state: state.pop("actuators"),
+    "no encoders": lambda described, state: state["seen"].pop("a"),
+    "target is a number": lambda described, state: state["target"].update(position=torch.zeros(())),
+    "NaN in the target": lambda described, state: state["target"]["position"].fill_(math.nan),
+    "of another kind": lambda described, state: described.update({"class": "HandKnowledge"}),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_journal_of_another_version_is_refused_and_nothing_is_taken_over(held, tmp_path, name) -> None:
+    journal, loop = journal_of(held, tmp_path)
+    again = loop_of(held, loop.plant.plant.plant)
+    before = {k: v.clone() for k, v in again.learned.state_dict().items() if isinstance(v, torch.Tensor)}
+    edited(journal.path, OTHERS[name])
+    with pytest.raises(FileFormatError, match="no journal of a turn"):
+        _ = journal.cut_short
+    with pytest.raises(FileFormatError, match="no journal of a turn"):
+        journal.resume(again)
+    assert all(torch.equal(again.learned.state_dict()[k], v) for k, v in before.items())
+
+
+def test_a_file_that_is_no_journal_is_not_written_over(held, tmp_path) -> None:
+    """What was learned of the hand is in such a file, too."""
+    loop, path = loop_of(held, Obedient(held[2], held[0])), tmp_path / "hand.ekm"
+    loop.knowledge.save(path)
+    kept = path.read_bytes()
+    with pytest.raises(FileFormatError, match="no journal of a turn"):
+        Journal(path).run(loop, PoseTarget.turned(held[0].state, held[1], degrees=20))
+    assert path.read_bytes() == kept
+    assert not loop.plant.plant.plant.given
+
+
+def test_two_turns_do_not_share_a_journal(held, tmp_path) -> None:
+    """The one that began first would lose its target and what it has learned."""
+    target, path = PoseTarget.turned(held[0].state, held[1], degrees=20), tmp_path / "turn.ekm"
+    first, second = (Journal(path).steps(loop_of(held, Obedient(held[2], held[0])), target) for _ in range(2))
+    next(first)
+    next(second)
+    with pytest.raises(OutputError, match="another turn is written there"):
+        next(first)
+    next(second)

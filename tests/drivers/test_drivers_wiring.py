@@ -28,7 +28,7 @@ def test_channels_are_in_the_order_of_the_description(tmp_path) -> None:
     assert right.value(2950.0) == pytest.approx(0.5)
     assert right.bus(0.5) == pytest.approx(2950.0)
     assert left.lower == pytest.approx(math.radians(-68.6))
-    assert wiring.joints == (Channel("left_1", 7, -1, 10.0, 50.0, line=wiring.joints[0].line),)
+    assert wiring.joints == (Channel("left_1", 7, -1, 10.0, 50.0),)
     assert wiring.limits == Limits(math.radians(20), math.radians(200), still_for=0.05, timeout=0.5)
     assert wiring.line("motors", "right", "sign") == 12
     assert wiring.line("motors", "left", "sign") == 15  # not given: where the motor begins

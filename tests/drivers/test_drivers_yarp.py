@@ -85,6 +85,9 @@ def test_a_port_that_is_not_there_is_named(yarp, tmp_path) -> None:
     path.write_text(path.read_text().replace("127.0.0.1:9", "localhost"))
     with pytest.raises(DescriptionError, match=r"icub.toml:5: .*host:port"):
         YarpPlant(path)
+    path.write_text(wiring(tmp_path, 9).read_text().replace("127.0.0.1:9", "icub..head:10000"))
+    with pytest.raises(BusError, match=r"name server at icub\.\.head"):
+        YarpPlant(path)
     with pytest.raises(DescriptionError, match="'analog' is missing"):
         YarpPlant(wiring(tmp_path, yarp.server, HALL))
 

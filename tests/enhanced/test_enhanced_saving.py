@@ -211,6 +211,16 @@ def test_counts_that_lead_out_of_the_memory_are_refused(entry: str, value: float
     assert not learner(x).any()
 
 
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_a_scale_that_is_none_is_refused(value: float) -> None:
+    """What is stated would be NaN, or turned round."""
+    learner = RecursiveLeastSquares(3, 2)
+    state = dict(learner.state_dict())
+    state["units.output.scale"] = torch.full((2,), value, dtype=torch.float64)
+    with pytest.raises(exceptions.StateMismatchError, match="scale is not above 0"):
+        learner.load_state_dict(state)
+
+
 def test_flipped_bits_and_cuts_of_a_file(tmp_path: Path) -> None:
     x, y = stream()
     learner, path = sogp(), tmp_path / "learner"

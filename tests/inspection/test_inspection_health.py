@@ -163,3 +163,17 @@ def test_the_command_reads_logs(tmp_path: Path, monkeypatch) -> None:
     code, said = health("later")
     assert code == 1
     assert "--hand NAME" in said
+
+
+def test_a_joint_that_is_never_read_is_said_and_the_other_tendons_are_watched() -> None:
+    made = Made(0)
+    made.move(30)
+    made.gain[1] = 0.0
+    made.move(gave=(0.0, -30.0))
+    made.move(14)
+    made.log.observations[10].q[2] = 1e300
+    for seen in made.log.observations:
+        seen.q[0] = math.nan
+    with pytest.warns(UserWarning, match="joints of left were never read"):
+        (found,) = hand_health(HAND, [(0, made.log)])
+    assert (found.actuator, found.part, found.motion) == ("right", "tendon", 30)

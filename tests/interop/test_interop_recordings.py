@@ -10,7 +10,7 @@ import pytest
 import torch
 from made_up import trajectory
 
-from torch_ekm.exceptions import DescriptionError, ParameterError, UnknownNameError
+from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.interop import log_to_lerobot, log_to_mcap, read_bag
 from torch_ekm.interop.bags import _numbers
@@ -142,6 +142,18 @@ def test_a_dataset_has_a_frame_for_each_observation(log: TrialLog, tmp_path: Pat
     assert [stats["mean"][0], stats["max"][0]] == pytest.approx([np.mean(times), max(times)])
     with pytest.raises(ParameterError, match="does not exist yet"):
         log_to_lerobot(log, folder)
+
+
+def test_a_dataset_on_a_full_disk_is_a_typed_error(log: TrialLog, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="extra 'interop'")
+    resource = pytest.importorskip("resource", reason="not on Windows")
+    most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, most[1]))
+    try:
+        with pytest.raises(OutputError, match="dataset cannot be written"):
+            log_to_lerobot(log, tmp_path / "dataset")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, most)
 
 
 def test_a_dataset_is_of_one_hand(log: TrialLog, tmp_path: Path) -> None:

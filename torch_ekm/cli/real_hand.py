@@ -118,7 +118,7 @@ def health(
 
     opened = [TrialLog.open(log) for log in logs]
     name = hand or opened[0].configuration.get("hand")
-    if not name:
+    if not isinstance(name, str) or not name:
         raise ParameterError("hand", name, "given by --hand NAME, since the log names no hand")
     motions: list[int] = []
 

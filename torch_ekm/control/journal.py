@@ -6,12 +6,14 @@ import contextlib
 import os
 from collections.abc import Generator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
+from .._checks import check_count, check_finite, check_kind, check_shape
 from .._recorded import check_state
-from ..exceptions import FileFormatError, ResumeError
+from ..exceptions import FileFormatError, OutputError, ResumeError
+from ..kinematics.tensors import as_tensors
 from ..plant import Observation, PlantStatus
 from ..residual.files import read, write
 from .closed_loop import ClosedLoop
@@ -21,6 +23,21 @@ from .guards import deg
 from .rehearsal import LONGEST
 
 _KIND = "turn under way"
+
+
+class _Turn(NamedTuple):
+    """What a journal says."""
+
+    learned: dict[str, Any]
+    target: PoseTarget
+    actuators: list[str]
+    a: torch.Tensor
+    """Where the motors stood [rad]."""
+    pose: PoseTarget | None
+    """Where the object was; None: it was not seen."""
+    motions: int
+    reason: str
+    """Why the turn ended; "": it has not."""
 
 
 class Journal:
@@ -41,6 +58,7 @@ class Journal:
 
     def __init__(self, path: str | os.PathLike) -> None:
         self.path = Path(path)
+        self._left: tuple[int, int] | None = None  # the file as it was written here
 
     @property
     def cut_short(self) -> bool:
@@ -49,18 +67,22 @@ class Journal:
         Raises:
             FileFormatError: the file is no journal.
         """
-        return os.path.exists(self.path) and not self._read()["reason"]
+        return os.path.exists(self.path) and not self._read().reason
 
     def run(self, loop: ClosedLoop, target: PoseTarget) -> Manipulation:
         """As :meth:`ClosedLoop.run`.
 
         Raises:
-            OutputError: the file cannot be written; the hand holds.
+            FileFormatError: there is a file that is no journal; it is left, and nothing moves.
+            OutputError: the file cannot be written, or another turn is; the hand holds.
         """
         return Manipulation.of(target, loop.controller.focus, self.steps(loop, target))
 
     def steps(self, loop: ClosedLoop, target: PoseTarget) -> Generator[Step, None, Stop]:
         """As :meth:`ClosedLoop.steps`."""
+        if os.path.exists(self.path):
+            self._read()
+        self._left = None
         self._write(loop, target, loop.plant.observe(), 0)
         with contextlib.closing(loop.steps(target)) as motions:
             k = 0
@@ -90,29 +112,30 @@ class Journal:
         against = self._against(loop, known, here)
         if against:
             raise ResumeError(self.path, against)
-        check_state(loop.learned, known["learned"])
-        loop.learned.load_state_dict(known["learned"])
-        target = PoseTarget(known["target"]["position"], known["target"]["rotation"])
-        return Manipulation.of(target, loop.controller.focus, self.steps(loop, target))
+        check_state(loop.learned, known.learned)
+        loop.learned.load_state_dict(known.learned)
+        return Manipulation.of(known.target, loop.controller.focus, self.steps(loop, known.target))
 
-    def _against(self, loop: ClosedLoop, known: dict[str, Any], here: Observation) -> str:
+    def _against(self, loop: ClosedLoop, known: _Turn, here: Observation) -> str:
         """Why the turn is not gone on with; empty: it is."""
-        hand, guards, last = loop.controller.kinematic.hand, loop.safety.guards, known["seen"]
-        if known["reason"]:
-            return f"the turn came to its end: {known['reason']}"
-        if known["actuators"] != list(hand.actuator_names):
-            return f"it is of a hand with the actuators {', '.join(known['actuators'])}"
+        hand, guards = loop.controller.kinematic.hand, loop.safety.guards
+        if known.reason:
+            return f"the turn came to its end: {known.reason}"
+        if known.actuators != list(hand.actuator_names):
+            return f"it is of a hand with the actuators {', '.join(known.actuators)}"
         if here.status is PlantStatus.LOST:
             return "the object is lost: grasp it again"
-        way, most = (here.a - last["a"]).abs(), max(LONGEST, guards.increment) + guards.encoder_jump
+        way, most = (here.a - known.a).abs(), max(LONGEST, guards.increment) + guards.encoder_jump
         if float(way.max()) > most:
             stands = f"encoder '{hand.actuator_names[int(way.argmax())]}' stands {deg(way.max())}"
             return f"{stands} from where it was ({deg(most)} are one motion): begin a new turn"
         if here.status is PlantStatus.NOT_SEEN:
-            return "" if last["seen"] else "the object was not seen, neither then nor now: clear the view"
-        off = PoseTarget(last["position"], last["rotation"]).error(here.state)
+            return "" if known.pose else "the object was not seen, neither then nor now: clear the view"
+        if known.pose is None:
+            return ""
+        off = known.pose.error(here.state)
         shift, turn = (float(torch.linalg.vector_norm(part)) for part in (off[:3], off[3:]))
-        if last["seen"] and (shift > guards.translation_jump or turn > guards.rotation_jump):
+        if shift > guards.translation_jump or turn > guards.rotation_jump:
             return f"the object is {1e3 * shift:.0f} mm and {deg(turn)} from where it was: begin a new turn"
         return ""
 
@@ -130,12 +153,37 @@ class Journal:
             "reason": reason,
             "actuators": list(loop.controller.kinematic.hand.actuator_names),
         }  # fmt: skip
+        if self._left and self._stamp() not in (None, self._left):
+            raise OutputError(self.path, "another turn is written there, too")
         write(self.path, {"class": _KIND}, state)
+        self._left = self._stamp()
 
-    def _read(self) -> dict[str, Any]:
+    def _stamp(self) -> tuple[int, int] | None:
+        with contextlib.suppress(FileNotFoundError):
+            status = os.stat(self.path)
+            return status.st_ino, status.st_mtime_ns
+        return None
+
+    def _read(self) -> _Turn:
         if not os.path.exists(self.path):
             raise ResumeError(self.path, "there is no such file")
         described, state = read(self.path)
-        if described.get("class") != _KIND or not {"learned", "target", "seen", "reason"} <= {*state}:
-            raise FileFormatError(self.path, "no journal of a turn")
-        return state
+        try:
+            if described["class"] != _KIND:
+                raise ValueError(f"it holds a {described['class']}")
+            learned, target, seen = (check_kind(k, state[k], dict) for k in ("learned", "target", "seen"))
+            actuators = [check_kind("actuators", name, str) for name in state["actuators"]]
+            (a,) = as_tensors(a=seen["a"])
+            check_shape("a", a, (len(actuators),))
+            check_finite("a", a)
+            pose = PoseTarget(seen["position"], seen["rotation"]) if seen["seen"] else None
+            goal, motions = (
+                PoseTarget(target["position"], target["rotation"]),
+                check_count("motions", state["motions"], 0),
+            )
+            return _Turn(
+                learned, goal, actuators, a, pose, motions, check_kind("reason", state["reason"], str)
+            )
+        except Exception as error:  # of another version, or of something else
+            problem = f"no journal of a turn ({error}): name another file"
+            raise FileFormatError(self.path, problem) from None

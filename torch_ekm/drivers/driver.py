@@ -408,7 +408,7 @@ class HandDriver(ABC):
         k = int(beyond.argmax())
         if not beyond[k] <= _BEYOND:
             at, low, high = (f"{math.degrees(x):.4g}" for x in (start[k], lower[k], upper[k]))
-            motor, place = self.wiring.motors[k], f"{self.wiring.path}:{self.wiring.motors[k].line}"
+            motor, place = self.wiring.motors[k], f"{self.wiring.path}:{self.wiring.motors[k].line()}"
             problem = (
                 f"it reads {at} deg, its range is {low} to {high} deg: correct 'zero' or 'range' ({place})"
             )

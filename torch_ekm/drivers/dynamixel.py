@@ -81,9 +81,7 @@ class DynamixelPlant(HandDriver):
         bus, motors = self.wiring.bus, self.wiring.motors
         self._refuse_what_no_servo_has()
         self._ids: list[int] = [int(one.id) for one in motors]
-        what = {
-            int(one.id): f"motor '{one.name}', id {one.id} ({self.wiring.path}:{one.line})" for one in motors
-        }
+        what = {int(one.id): f"motor '{one.name}', id {one.id} ({bus.path}:{one.line()})" for one in motors}
         try:
             self._port = DynamixelPort(bus.text("port"), bus.whole("baud", 57600), what.__getitem__)
         except ValueError as error:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from ..typing import Float, Tensor
 
 _SENSOR_STD = 0.005  # s_h [rad]
 _SPRING_STD = 1.0  # s_0 [rad]: springs decide only what nothing measures
+_POLL = 0.005  # [s]
 
 
 class Posture:
@@ -33,24 +34,18 @@ class Posture:
     """
 
     def __init__(self, hand: HandDescription, sensed: Sequence[str]) -> None:
-        self._hand = hand
-        n, all_sensed = hand.n_q, tuple(sensed) == hand.joint_names
+        self._hand, self._all = hand, tuple(sensed) == hand.joint_names
+        self._rest, K = torch.from_numpy(hand.spring_rest), torch.from_numpy(hand.spring_stiffness)
+        n, n_s = hand.n_q, len(sensed)
         S = torch.eye(n, dtype=torch.float64)[[hand.joint_names.index(name) for name in sensed]]
-        K = torch.from_numpy(hand.spring_stiffness)
-        blocks = [
-            (S, _SENSOR_STD),
-            (torch.from_numpy(hand.actuation_jacobian), ENCODER_STD),
-            (torch.from_numpy(hand.coupling.reshape(-1, n)), COUPLING_STD),
-            (torch.diag((K / K.mean()).clamp(min=1e-3).sqrt()), _SPRING_STD),
-        ]
-        A = torch.cat([block / std for block, std in blocks])
-        m = len(S) + hand.n_a
-        scale = torch.tensor([1 / _SENSOR_STD] * len(S) + [1 / ENCODER_STD] * hand.n_a, dtype=torch.float64)
-        self._gain = torch.linalg.pinv(A)[:, :m] * scale
-        self._rest = torch.from_numpy(hand.spring_rest)
-        offset = torch.from_numpy(hand.actuator_offset)
-        self._middle = torch.cat([S @ self._rest, offset + blocks[1][0] @ self._rest])
-        self._all = all_sensed
+        measured = torch.cat([S, torch.from_numpy(hand.actuation_jacobian)])
+        std = torch.tensor([_SENSOR_STD] * n_s + [ENCODER_STD] * hand.n_a, dtype=torch.float64)
+        ties = torch.from_numpy(hand.coupling.reshape(-1, n)) / COUPLING_STD
+        springs = torch.diag((K / K.mean()).clamp(min=1e-3).sqrt()) / _SPRING_STD
+        A = torch.cat([measured / std[:, None], ties, springs])
+        self._gain = torch.linalg.pinv(A)[:, : len(measured)] * (1 / std)
+        self._middle = measured @ self._rest
+        self._middle[n_s:] += torch.from_numpy(hand.actuator_offset)
 
     def __call__(self, h: Float[Tensor, " n"], a: Float[Tensor, " n_a"]) -> Float[Tensor, " n_q"]:
         """q [rad] from the sensed joints' angles h and the encoders a [rad]."""
@@ -61,9 +56,6 @@ class Posture:
             bent = torch.from_numpy(self._hand.bent(q.numpy()))
             q = self._rest + self._gain @ (torch.cat([h, a - bent]) - self._middle)
         return q
-
-
-_POLL = 0.005  # [s]
 
 
 class Sighting(NamedTuple):
@@ -143,24 +135,22 @@ class WithPose(PlantWrapper):
         if self.lost is not None and self.lost(sighting):
             status = PlantStatus.LOST
         R, o = self.frame[:3, :3], self.frame[:3, 3]
-        info: dict[str, Any] = dict(seen.info)
+        info, now = dict(seen.info), max(seen.time, time.monotonic())
         if sighting.covariance is not None:
             info["estimate"] = {"pose_covariance": sighting.covariance}
-        now = max(seen.time, time.monotonic())
-        changes: dict[str, Any] = {} if sighting.q is None else {"q": sighting.q}
-        stamps = seen.taken._replace(pose=min(sighting.taken, now))
+        q, stamps = seen.q, seen.taken._replace(pose=min(sighting.taken, now))
         if sighting.q is not None:
-            stamps = stamps._replace(joints=stamps.pose)
+            q, stamps = sighting.q, stamps._replace(joints=stamps.pose)
             info.pop("sensed", None)
         return dataclasses.replace(
             seen,
+            q=q,
             position=R @ sighting.position.double() + o,
             rotation=R @ sighting.rotation.double(),
             status=status,
             info=info,
             time=now,
             stamps=stamps,
-            **changes,
         )
 
     def _look(self, after: float) -> Sighting | None:

@@ -20,7 +20,6 @@ from .one_master import OneMaster
 from .pose import Sighting
 from .wiring import Channel
 
-_KINDS = ("trajectory", "array", "joint_state")
 _TIMEOUT = 5.0  # [s] for the first message and the first subscriber: discovery takes a while
 _DISCOVERED = 0.4  # [s] by then a node that runs is known
 _ONLY_RELIABLE = "; [bus] reliable = true hears reliable publishers only"
@@ -58,16 +57,14 @@ class Ros2Plant(HandDriver):
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)
         bus, rclpy = self.wiring.bus, require("rclpy")
-        self._kind = bus.text("kind", "trajectory")
-        if self._kind not in _KINDS:
-            raise bus.error(f"'kind' must be one of {', '.join(_KINDS)}, got '{self._kind}'")
-        topic, self._states_topic = bus.text("command"), bus.text("joint_states", "/joint_states")
+        states, array = require("sensor_msgs.msg").JointState, require("std_msgs.msg").Float64MultiArray
+        self._trajectories = require("trajectory_msgs.msg")
+        kinds = {"trajectory": self._trajectories.JointTrajectory, "array": array, "joint_state": states}
+        self._kind, topic = bus.text("kind", "trajectory"), bus.text("command")
+        if self._kind not in kinds:
+            raise bus.error(f"'kind' must be one of {', '.join(kinds)}, got '{self._kind}'")
+        self._command = kinds[self._kind]
         qos, executors = require("rclpy.qos"), require("rclpy.executors")
-        self._messages = {
-            "sensor": require("sensor_msgs.msg"),
-            "trajectory": require("trajectory_msgs.msg"),
-            "std": require("std_msgs.msg"),
-        }
         self._master: OneMaster | None = None
         # by shared memory a process may hear nothing after one before it was killed; users may set another
         os.environ.setdefault("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
@@ -84,20 +81,15 @@ class Ros2Plant(HandDriver):
             depth=50, reliability=policy.RELIABLE if self._reliable else policy.BEST_EFFORT
         )
         self._ids = [str(one.id) for one in (*self.wiring.motors, *self.wiring.joints)]
-        self._states = self.gathered(self._states_topic, self._ids)
-        self.subscribe(self._messages["sensor"].JointState, self._states_topic, self._take)
+        self._states = self.gathered(bus.text("joint_states", "/joint_states"), self._ids)
+        self.subscribe(states, self._states.topic, self._take)
         self._taxels = [self._places(one) for one in self.wiring.fingertips]
-        array = self._messages["std"].Float64MultiArray
-        if self._taxels:
-            self._forces = self.gathered(
-                bus.text("fingertips"), [k for taxels in self._taxels for k in taxels]
-            )
+        all_taxels = [k for taxels in self._taxels for k in taxels]
+        if all_taxels:
+            self._forces = self.gathered(bus.text("fingertips"), all_taxels)
             self.subscribe(array, self._forces.topic, self._take_force)
-        kind = {"trajectory": self._messages["trajectory"].JointTrajectory,
-                "array": array,
-                "joint_state": self._messages["sensor"].JointState}[self._kind]  # fmt: skip
         with _told(topic):
-            self._publisher = self.node.create_publisher(kind, topic, 1)
+            self._publisher = self.node.create_publisher(self._command, topic, 1)
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
@@ -105,21 +97,20 @@ class Ros2Plant(HandDriver):
         try:
             if not self.dry_run:
                 self._master = OneMaster(f"{topic} of domain {os.environ.get('ROS_DOMAIN_ID', 0)}")
-            states = self._messages["sensor"].JointState
             self._first(
                 lambda: None not in self._newest("position", self._ids),
                 lambda: self._absent(self._states, "position", self._ids, states),
-                self._states_topic,
+                self._states.topic,
             )
-            for taxels in self._taxels:
+            if all_taxels:
                 self._first(
-                    lambda taxels=taxels: None not in self._pressed(taxels),
-                    lambda taxels=taxels: self._absent(self._forces, "force", taxels, array),
+                    lambda: None not in self._pressed(all_taxels),
+                    lambda: self._absent(self._forces, "force", all_taxels, array),
                     self._forces.topic,
                 )
             self._first(
                 lambda: self.dry_run or self._publisher.get_subscription_count() > 0,
-                lambda: self.lacks(topic, kind, "subscriptions"),
+                lambda: self.lacks(topic, self._command, "subscriptions"),
                 topic,
             )
             # a node of our own name may be one that was killed: it stays in the graph for some seconds
@@ -264,17 +255,15 @@ class Ros2Plant(HandDriver):
         )
 
     def _write(self, goal: Sequence[float], seconds: float) -> None:
-        goal = [float(x) for x in goal]
-        names = [str(one.id) for one in self.wiring.motors]
+        goal, names = [float(x) for x in goal], self._ids[: len(goal)]
         if self._kind == "trajectory":
-            kind = self._messages["trajectory"]
-            point = kind.JointTrajectoryPoint(positions=goal)
+            point = self._trajectories.JointTrajectoryPoint(positions=goal)
             point.time_from_start.nanosec = int(1e9 * min(max(seconds, 0.01), 0.9))
-            message = kind.JointTrajectory(joint_names=names, points=[point])
+            message = self._command(joint_names=names, points=[point])
         elif self._kind == "array":
-            message = self._messages["std"].Float64MultiArray(data=goal)
+            message = self._command(data=goal)
         else:
-            message = self._messages["sensor"].JointState(name=names, position=goal)
+            message = self._command(name=names, position=goal)
             message.header.stamp = self.node.get_clock().now().to_msg()
         if self._publisher.get_subscription_count() == 0:
             raise BusError(self._publisher.topic_name, "no node subscribes to it any more")

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +45,12 @@ class Channel:
     upper: float = math.inf
     count: int = 1
     """A fingertip's force is the sum of so many taxels, the first at ``id``."""
-    line: int = 0
-    """Where it begins in the wiring file."""
+    lines: Mapping[str, int] = field(default_factory=dict, compare=False)
+    """Line of each of its keys in the wiring file; "" is where it begins."""
+
+    def line(self, key: str = "") -> int:
+        """Line of a key, or where the channel begins; 0: it is in no file."""
+        return self.lines.get(key, self.lines.get("", 0))
 
     def value(self, bus: float) -> float:
         """What a reading means [rad, N]."""
@@ -86,19 +90,14 @@ class LinedTable(TomlTable):
     """A table whose errors name the line: of the key that the problem quotes, else of the table's head."""
 
     def __init__(
-        self, path: Path, place: str, data: Any, valid: Iterable[str], lines: dict[str, int]
+        self, path: Path, place: str, data: Any, valid: Iterable[str], lines: Mapping[str, int]
     ) -> None:
         self.lines = lines
         super().__init__(path, place, data, valid)
 
-    @property
-    def line(self) -> int:
-        """Of the table's head, from 1 on; 0: it has none."""
-        return self.lines.get("", 0)
-
     def where(self, key: str) -> str:
-        """A key, and the line where it stands."""
-        return f"'{key}' ({self.path}:{self.lines.get(key, self.line)})"
+        """A key, and the line where it stands, or its table."""
+        return f"'{key}' ({self.path}:{self.lines.get(key, self.lines.get('', 0))})"
 
     def error(self, problem: str) -> DescriptionError:
         named = (key for name in _QUOTED.findall(problem) for key in (name, f"{name}_deg"))
@@ -125,8 +124,6 @@ class Wiring:
     limits: Limits
     bus: LinedTable
     """The table ``[bus]``, whose keys are the driver's."""
-    lines: dict[str, dict[str, int]]
-    """Line of each key of each table, such as ``lines["motors 2"]["sign"]``; "" is the table's head."""
 
     @classmethod
     def read(
@@ -153,10 +150,8 @@ class Wiring:
             DescriptionError: the file is missing or wrong; the message names line and remedy.
         """
         path = Path(path)
-        data = read_toml(path, "wiring file")
-        lines = _lines(toml_text(path, "wiring file"))
+        data, lines, head = _opened(path)
         top = LinedTable(path, "file", data, _TABLES, {name: at.get("", 0) for name, at in lines.items()})
-        head = LinedTable(path, "[hand]", data.get("hand"), _HAND, lines.get("hand", {}))
         if head.text("driver") != driver:
             raise head.error(f"'driver' is '{head.text('driver')}', this is the driver '{driver}'")
         if hand is None:
@@ -167,16 +162,17 @@ class Wiring:
             except UnknownNameError as error:
                 raise head.error(f"'description': {error}") from None
 
-        def at(kind: str, k: int) -> dict[str, int]:
-            return lines.get(f"{kind} {k}", {})
-
         def channel(kind: str, valid: tuple[str, ...], names: tuple[str, ...], unit: float) -> list[Channel]:
-            found = [
-                _channel(LinedTable(path, f"[[{kind}]]", one, valid, at(kind, k)), hand, names, named, unit)
-                for k, one in enumerate(_list(top, kind))
-            ]
+            entries = top.data.get(kind, [])
+            if not isinstance(entries, list):
+                raise top.error(f"'{kind}' must be written as [[{kind}]], a table for each")
+            tables = (
+                LinedTable(path, f"[[{kind}]]", one, valid, lines.get(f"{kind} {k}", {}))
+                for k, one in enumerate(entries)
+            )
+            found = [_channel(table, hand, names, named, unit) for table in tables]
             for what in ("name", "id"):
-                _unique(path, kind, what, found, lines)
+                _unique(path, kind, what, found)
             return sorted(found, key=lambda one: names.index(one.name))
 
         motors = channel("motors", _MOTOR, hand.actuator_names, per_rad)
@@ -205,18 +201,15 @@ class Wiring:
         except ParameterError as error:
             raise given.error(f"'{error.name}' must be {error.valid}, got {error.value}") from None
         table = LinedTable(path, "[bus]", data.get("bus", {}), bus, lines.get("bus", {}))
-        return cls(path, driver, hand, tuple(motors), tuple(joints), tuple(fingertips), limits, table, lines)
+        return cls(path, driver, hand, tuple(motors), tuple(joints), tuple(fingertips), limits, table)
 
     def error(self, kind: str, one: Channel, problem: str, key: str = "") -> DescriptionError:
         """Of a motor, joint or fingertip, with the line of a key or of its table's head."""
-        place = f"{self.path}:{self.line(kind, one.name, key)}"
-        return DescriptionError(place, f"[[{kind}]] '{one.name}': {problem}")
+        return DescriptionError(f"{self.path}:{one.line(key)}", f"[[{kind}]] '{one.name}': {problem}")
 
     def line(self, kind: str, name: str, key: str = "") -> int:
         """Line of a key of the motor, joint or fingertip ``name``, or of its table's head; 0: it has none."""
-        head = next((one.line for one in getattr(self, kind) if one.name == name), 0)
-        tables = (at for place, at in self.lines.items() if place.startswith(f"{kind} "))
-        return next((at.get(key, head) for at in tables if at[""] == head), head)
+        return next((one.line(key) for one in getattr(self, kind) if one.name == name), 0)
 
 
 def driver_of(path: str | Path) -> str:
@@ -225,16 +218,13 @@ def driver_of(path: str | Path) -> str:
     Raises:
         DescriptionError: the file is missing or wrong.
     """
-    data, path = read_toml(Path(path), "wiring file"), Path(path)
-    lines = _lines(toml_text(path, "wiring file")).get("hand", {})
-    return LinedTable(path, "[hand]", data.get("hand"), _HAND, lines).text("driver")
+    return _opened(Path(path))[2].text("driver")
 
 
-def _list(top: LinedTable, kind: str) -> list[Any]:
-    found = top.data.get(kind, [])
-    if not isinstance(found, list):
-        raise top.error(f"'{kind}' must be written as [[{kind}]], a table for each")
-    return found
+def _opened(path: Path) -> tuple[dict[str, Any], dict[str, dict[str, int]], LinedTable]:
+    """What stands in the file, in which lines, and its table ``[hand]``."""
+    data, lines = read_toml(path, "wiring file"), _lines(toml_text(path, "wiring file"))
+    return data, lines, LinedTable(path, "[hand]", data.get("hand"), _HAND, lines.get("hand", {}))
 
 
 def _channel(
@@ -263,7 +253,7 @@ def _channel(
         lower=lower,
         upper=upper,
         count=table.whole("count", 1, least=1),
-        line=table.line,
+        lines=table.lines,
     )
 
 
@@ -281,18 +271,15 @@ def _range(table: LinedTable, own: Actuator) -> tuple[float, float]:
     return lower, upper
 
 
-def _unique(path: Path, kind: str, what: str, found: list[Channel], lines: dict[str, dict[str, int]]) -> None:
+def _unique(path: Path, kind: str, what: str, found: list[Channel]) -> None:
     first: dict[Any, Channel] = {}
-    for k, one in enumerate(found):
+    for one in found:
         value = getattr(one, what)
-        if value in first:
-            line = lines.get(f"{kind} {k}", {}).get(what, one.line)
-            other = f"line {first[value].line}"
-            if what == "id":
-                other = f"'{first[value].name}', {other}"
-            problem = f"{what} {value!r} is that of {other}, too; each has its own"
-            raise DescriptionError(f"{path}:{line}", f"[[{kind}]] '{one.name}': {problem}")
-        first[value] = one
+        other = first.setdefault(value, one)
+        if other is not one:
+            place = f"'{other.name}', line {other.line()}" if what == "id" else f"line {other.line()}"
+            problem = f"{what} {value!r} is that of {place}, too; each has its own"
+            raise DescriptionError(f"{path}:{one.line(what)}", f"[[{kind}]] '{one.name}': {problem}")
 
 
 def _lines(text: str) -> dict[str, dict[str, int]]:

@@ -221,7 +221,7 @@ class _Connection:
     def _told(self) -> Iterator[None]:
         try:
             yield
-        except OSError as error:
+        except (OSError, UnicodeError) as error:  # also of a host's name that cannot be one
             self.close()
             where = "{} at {}:{}".format(self.name, *self._where)
             raise BusError(f"YARP port {where}", f"{type(error).__name__}: {error}") from error

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._noise import NOISE
+from .._warnings import warn
 from ..description import HandDescription
 from ..estimation.parameter_filter import update
 from ..exceptions import StateError
@@ -48,6 +49,8 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
     object is lost all tendons give way: of this motion only what exceeds twice any other's counts. The first
     12 motions of an actuator, and those after a change, are its baseline.
 
+    A tendon whose joints were never measured is named in a warning.
+
     Args:
         hand: its description.
         trials: number and log, in order.
@@ -58,8 +61,10 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
     names = hand.actuator_names
     watches = {(name, part): _Watch(part) for name in names for part in _PRIORS}
     changes: list[tuple[str, _Watch, _Watch]] = []
+    off, read = [], set()  # errors of the tendons, and those whose joints were measured
     for at, lost, motion in _motions(hand, trials):
         off = [abs(watches[name, "tendon"].error(*motion[name, "tendon"][:2])) for name in names]
+        read |= {name for name, one in zip(names, off, strict=True) if math.isfinite(one)}
         for (name, part), (x, y, stood) in motion.items():
             others = [one for one, other in zip(off, names, strict=True) if other != name]
             excused = 2 * max(others, default=0.0) if lost and part == "tendon" else 0.0
@@ -72,6 +77,8 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
             changes.append((name, worst, after))
             for watch in watches.values():  # what one gives way to shows at others
                 watch.sum, watch.misfits = 0.0, []
+    if off and (unread := [name for name in names if name not in read]):
+        warn(f"joints of {', '.join(unread)} were never read: nothing is known of what they pass on")
     return [HealthChange(name, old.part, *old.misfits[0][0], old.against(new)) for name, old, new in changes]
 
 
@@ -88,7 +95,10 @@ def _motions(
             ours = f"'{hand.name}' has {hand.n_q} and {hand.n_a}"
             raise StateError(f"trial {trial} is of {q.shape[1]} joints and {a.shape[1]} actuators, {ours}")
         v, w = np.stack([one.numpy() for one in log.commands]), np.diff(a, axis=0)
-        pulled, s = np.diff(hand.unloaded(q), axis=0), np.sign(v)
+        silent, s = ~np.isfinite(q), np.sign(v)  # a joint that is not read says nothing of its own tendons
+        away = hand.unloaded(np.where(silent, 0.0, q))
+        away[silent @ (hand.actuation_jacobian != 0).T] = np.nan
+        pulled = np.diff(away, axis=0)
         moved = (np.abs(v) > ServoModel.resolution) & (a[1:] > low) & (a[1:] < high)
         held = [one.status is not PlantStatus.LOST for one in log.observations]
         for k in range(len(v)):
@@ -126,7 +136,7 @@ class _Watch:
         """Judge a motion and learn from it; errors up to ``excused`` are none."""
         error = self.error(x, y)
         bound = self.part == "servo" and stood and (error < 0 or self.count < BASELINE)
-        if not math.isfinite(error) or bound:
+        if not math.isfinite(error * error) or bound:
             return  # nothing was read; a motor that stands within its dead zone does not show how wide it is
         spread = 1 + float(x @ self.P @ x)
         z2 = max(0.0, abs(error) - excused) ** 2 / (self.squares / self.weight * spread)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from .._extras import require
-from .._files import make_folder
+from .._files import make_folder, told_as_output_error
 from ..exceptions import ParameterError
 from ..kinematics import se3
 from ..plant import Trajectory, TrialLog
@@ -34,6 +34,7 @@ def log_to_lerobot(log: TrialLog, folder: str | Path, task: str = "turn the obje
     Raises:
         MissingExtraError: pandas or pyarrow is not installed.
         ParameterError: the folder exists; there is no trial; trials have other sensors than the first one.
+        OutputError: the dataset cannot be written.
     """
     pd, _, folder = require("pandas", "interop"), require("pyarrow", "interop"), Path(folder)
     if folder.exists():
@@ -59,11 +60,6 @@ def log_to_lerobot(log: TrialLog, folder: str | Path, task: str = "turn the obje
     for place in ("data", "meta/episodes"):
         whole |= {f"{place}/chunk_index": 0, f"{place}/file_index": 0}
     table = pd.DataFrame({k: list(v) if v.shape[1] > 1 else v[:, 0] for k, v in columns.items()})
-    for place, rows in (("data", table), ("meta/episodes", pd.DataFrame(whole))):
-        path = folder / place / _FILE.format(chunk_index=0, file_index=0)
-        make_folder(path.parent)
-        rows.to_parquet(path, index=False)
-    pd.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta/tasks.parquet")
     features = {k: {"dtype": str(v.dtype), "shape": [v.shape[1]], "names": None} for k, v in columns.items()}
     info = {
         "codebase_version": "v3.0", "robot_type": str(log.configuration.get("hand", "hand")),
@@ -77,8 +73,14 @@ def log_to_lerobot(log: TrialLog, folder: str | Path, task: str = "turn the obje
         name: {"count": [len(value)], **{one: getattr(value, one)(0).tolist() for one in figures}}
         for name, value in columns.items()
     }
-    for name, content in (("info", info), ("stats", stats)):
-        (folder / f"meta/{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+    with told_as_output_error(folder):
+        for place, rows in (("data", table), ("meta/episodes", pd.DataFrame(whole))):
+            path = folder / place / _FILE.format(chunk_index=0, file_index=0)
+            make_folder(path.parent)
+            rows.to_parquet(path, index=False)
+        pd.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta/tasks.parquet")
+        for name, content in (("info", info), ("stats", stats)):
+            (folder / f"meta/{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     return folder
 
 

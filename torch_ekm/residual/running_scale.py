@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -78,6 +79,10 @@ class RunningScale(nn.Module):
         self.cuts = any(grows or ())
         reach = [REACH if cut else math.inf for cut in grows or [False] * features]
         self.reach = nn.Buffer(torch.tensor(reach, **factory), persistent=False)
+
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the entries of a state that is to be loaded."""
+        return [] if bool((state["scale"] > 0).all()) else ["scale is not above 0"]
 
     def forward(self, x: Float[Tensor, "*batch features"]) -> Float[Tensor, "*batch features"]:
         """x in the learner's units."""
