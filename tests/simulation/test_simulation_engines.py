@@ -132,3 +132,15 @@ def test_changes_in_mid_run_do_in_both_the_same(change: dict[str, Any]) -> None:
 def test_an_unknown_engine_is_named_with_those_there_are(make: Any) -> None:
     with pytest.raises(UnknownNameError, match="sapien, mujoco"):
         make("bullet")
+
+
+@pytest.mark.parametrize("engine", ["sapien", "mujoco"])
+def test_where_an_object_grows_broader_pads_touch_what_is_described(engine: str) -> None:
+    """The flashlight's head begins beside the middle finger; a capsule's cap would reach under its pad."""
+    plant = SimulatedHand("icub_right", "flashlight", engine=engine)
+    truth = plant.reset(4).truth
+    assert truth is not None
+    contacts = KinematicModel(plant.hand, plant.object).touching(truth.state)
+    assert set(contacts.finger) == {"thumb", "index", "middle"}
+    assert contacts.gap.abs().max() < 1e-4
+    plant.close()

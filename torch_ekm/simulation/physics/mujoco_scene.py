@@ -96,17 +96,19 @@ class MujocoScene:
             body.add_joint(type=kinds.mjJNT_HINGE, axis=self._normal)
         names = [f"object/{k}" for k in range(len(obj.shapes))]
         for name, shape in zip(names, obj.shapes, strict=True):
-            self._add_shape(body, name, shape.transform, shape)
+            self._add_shape(body, name, shape.transform, shape, flat=len(obj.shapes) > 1)
         return names
 
-    def _add_shape(self, body: Any, name: str, at: Array, shape: Shape) -> None:
+    def _add_shape(self, body: Any, name: str, at: Array, shape: Shape, flat: bool = False) -> None:
+        """``flat``: a cylinder's ends are, as where a broader part of an object begins."""
         kinds = self._mj.mjtGeom
         if shape.kind == "box":
             kind, size = kinds.mjGEOM_BOX, np.array(shape.size) / 2
         elif shape.kind == "sphere":
             kind, size = kinds.mjGEOM_SPHERE, np.array([shape.size[0], 0.0, 0.0])
-        else:  # cylinders as capsules, as in SAPIEN: the side is the same
-            kind, size = kinds.mjGEOM_CAPSULE, np.array([shape.size[0], shape.size[1] / 2, 0.0])
+        else:  # else cylinders are capsules, as in SAPIEN: the side is the same
+            kind = kinds.mjGEOM_CYLINDER if flat and shape.kind == "cylinder" else kinds.mjGEOM_CAPSULE
+            size = np.array([shape.size[0], shape.size[1] / 2, 0.0])
         quaternion = self._quaternion(at[:3, :3])
         body.add_geom(
             name=name, type=kind, size=size, pos=at[:3, 3], quat=quaternion, contype=0, conaffinity=0

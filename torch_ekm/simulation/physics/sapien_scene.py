@@ -20,6 +20,8 @@ _TOLERANCE_SPEED = 0.1  # [m/s]
 _CONTACT_OFFSET = 0.0005  # [m]; at the default 10 mm friction acts on points that do not touch
 _HAND_GROUP = 1  # bodies that share a bit of the third collision word ignore each other
 _TORQUE_LIMIT = 100.0  # [N m]; a limit that never acts
+_SIDES = 64  # of a cylinder with flat ends: 0.06 % of the radius; of more PhysX drops some
+_FINE = 1e3  # sizes are given in mm: PhysX merges corners that are less than some mm apart
 
 
 @cache
@@ -128,7 +130,7 @@ class SapienScene:
         entity.name = obj.name
         self._object: Any = self._physx.PhysxRigidDynamicComponent()
         for shape in obj.shapes:
-            self._attach(self._object, shape.transform, shape, group=0)
+            self._attach(self._object, shape.transform, shape, group=0, flat=len(obj.shapes) > 1)
         self._object.linear_damping = self._object.angular_damping = 0.0
         entity.add_component(self._object)
         self._scene.add_entity(entity)
@@ -140,14 +142,21 @@ class SapienScene:
                 raise ParameterError("planar_normal", tuple(hand.planar_normal), valid)
             self._object.set_locked_motion_axes([*across.tolist(), *(~across).tolist()])
 
-    def _attach(self, body: Any, placed: Array, shape: Shape, group: int) -> Any:
+    def _attach(self, body: Any, placed: Array, shape: Shape, group: int, flat: bool = False) -> Any:
+        """``flat``: a cylinder's ends are, as where a broader part of an object begins."""
         if shape.kind == "box":
             built = self._physx.PhysxCollisionShapeBox(np.array(shape.size) / 2, self._material)
         elif shape.kind == "sphere":
             built = self._physx.PhysxCollisionShapeSphere(shape.size[0], self._material)
+        elif flat and shape.kind == "cylinder":
+            # PhysX has no smooth cylinder: its own has 32 flat sides, this one as many as it takes
+            turns, (radius, length) = 2 * np.pi * np.arange(_SIDES) / _SIDES, shape.size
+            radius /= np.sqrt(np.cos(np.pi / _SIDES))  # sides are as much inside as edges are outside
+            rim = np.stack([radius * np.cos(turns), radius * np.sin(turns), np.full(_SIDES, length / 2)], 1)
+            corners, scale = _FINE * np.concatenate([rim, rim * (1, 1, -1)]), np.full(3, 1 / _FINE)
+            built = self._physx.PhysxCollisionShapeConvexMesh(corners, scale, self._material)
         else:
-            # PhysX has no smooth cylinder (32 flat sides). A capsule has the same side; its caps stick
-            # out by a radius at either end, where nothing grasps.
+            # a capsule has a cylinder's smooth side; its caps stick out by a radius, where nothing grasps
             radius, length = shape.size
             built = self._physx.PhysxCollisionShapeCapsule(radius, length / 2, self._material)
             placed = placed @ x_axis_to(np.array([0.0, 0.0, 1.0]))
