@@ -142,5 +142,5 @@ def test_where_an_object_grows_broader_pads_touch_what_is_described(engine: str)
     assert truth is not None
     contacts = KinematicModel(plant.hand, plant.object).touching(truth.state)
     assert set(contacts.finger) == {"thumb", "index", "middle"}
-    assert contacts.gap.abs().max() < 1e-4
+    assert contacts.gap.abs().max() < 2e-4  # [m]; soft contacts give way by half of it
     plant.close()
