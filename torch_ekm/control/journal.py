@@ -176,14 +176,11 @@ class Journal:
             (a,) = as_tensors(a=seen["a"])
             check_shape("a", a, (len(actuators),))
             check_finite("a", a)
+            goal = PoseTarget(target["position"], target["rotation"])
             pose = PoseTarget(seen["position"], seen["rotation"]) if seen["seen"] else None
-            goal, motions = (
-                PoseTarget(target["position"], target["rotation"]),
-                check_count("motions", state["motions"], 0),
-            )
-            return _Turn(
-                learned, goal, actuators, a, pose, motions, check_kind("reason", state["reason"], str)
-            )
+            motions = check_count("motions", state["motions"], 0)
+            reason = check_kind("reason", state["reason"], str)
+            return _Turn(learned, goal, actuators, a, pose, motions, reason)
         except Exception as error:  # of another version, or of something else
             problem = f"no journal of a turn ({error}): name another file"
             raise FileFormatError(self.path, problem) from None

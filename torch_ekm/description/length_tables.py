@@ -197,7 +197,7 @@ class PinnedPoints:
                 for joint in urdf.joints_to(link)
             ]
             self._chains.append((parts, np.array(point, dtype=np.float64)))
-        self._n_q = len(names)
+        self._n_q, self._rotation = len(names), require("scipy.spatial.transform").Rotation
         self._directions = np.eye(3)
         rows = np.concatenate([self(q)[1].T for q in postures])
         _, size, directions = np.linalg.svd(rows, full_matrices=False)
@@ -221,7 +221,7 @@ class PinnedPoints:
             o, R = o + R @ transform[:3, 3], R @ transform[:3, :3]
             if joint is not None:
                 joints.append((joint, R @ axis, o))
-                R = R @ require("scipy.spatial.transform").Rotation.from_rotvec(q[joint] * axis).as_matrix()
+                R = R @ self._rotation.from_rotvec(q[joint] * axis).as_matrix()
         at, J = o + R @ point, np.zeros((3, self._n_q))
         for joint, axis, origin in joints:
             J[:, joint] += np.cross(axis, at - origin)

@@ -261,7 +261,7 @@ class ContactMotion:
         way = Way(here, self.loads.pull, da, total)
         for correction in range(_CORRECTIONS):
             done = self._solve(here, loads, way)
-            if done is None or self._leaps(way.total + done.answer.z):
+            if done is None or (self._farthest(way.total + done.answer.z) > (_FARTHEST, _LEAP)).any():
                 return None
             size, doing = float(np.abs(done.answer.z).max()), done.doing
             if correction and (size < _SAME or (size < _FINE and doing == was)):
@@ -281,7 +281,7 @@ class ContactMotion:
         for _ in range(_FALLS):
             way = Way(self._grasp, self.loads.pull, da, still)
             done = self._solve(self._grasp, self.loads, way, _DAMPING)
-            if done is None or self._farthest(fallen := fallen + done.answer.z) > _FARTHEST:
+            if done is None or self._farthest(fallen := fallen + done.answer.z).max() > _FARTHEST:
                 return None
             self._stand(done.state, None, done.loads)
             da = np.zeros(len(da))
@@ -311,16 +311,11 @@ class ContactMotion:
         state = _moved(here.state, self._laws.S @ answer.z)
         return _Solved(contacts.finger, program, answer, after, state)
 
-    def _farthest(self, z: Array) -> float:
-        """Largest entry of the increment, translations in units of L."""
+    def _farthest(self, z: Array) -> Array:
+        """Largest entries of an increment: of the joints, and of the object, translations in units of L."""
         joints = self._laws.joints
         n_y = joints.shape[1]
-        return max(float(np.abs(joints @ z[:n_y]).max()), float(np.abs(z[n_y:]).max()))
-
-    def _leaps(self, z: Array) -> bool:
-        """An increment of a substep leads to another equilibrium than the motion."""
-        turned = z[self._laws.joints.shape[1] :]
-        return self._farthest(z) > _FARTHEST or float(np.abs(turned).max()) > _LEAP
+        return np.array([np.abs(joints @ z[:n_y]).max(), np.abs(z[n_y:]).max()])
 
     def _report(
         self, before: GraspState, names: tuple[str, ...], last: _Substep, slid: dict[str, float]

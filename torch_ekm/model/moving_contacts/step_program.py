@@ -211,7 +211,7 @@ def mode_linearization(
     Raises:
         NoContactError: nothing bears.
     """
-    model, n_c = laws.model, grasp.contacts.n_c
+    model, o, hand, n_c = laws.model, laws.model.options, laws.hand, grasp.contacts.n_c
     bears = np.flatnonzero(answer.active[:n_c]).tolist()
     if not bears:
         raise NoContactError("no finger touches the object after this motion")
@@ -234,7 +234,7 @@ def mode_linearization(
         kin,
         mu=torch.tensor(mu),
         lam=-torch.from_numpy(loads.pull),
-        residual=torch.zeros(laws.hand.n_q, dtype=torch.float64),
+        residual=torch.zeros(hand.n_q, dtype=torch.float64),
         stop_torque=torch.from_numpy(loads.stop),
         margin=margin,
         relative_margin=relative,
@@ -251,6 +251,6 @@ def mode_linearization(
         actuator_force_sensitivity=torch.from_numpy(laws.actuator_response(grasp, rates, n_c)),
         held_joints=torch.from_numpy(stop != 0),
         stability=stability,
-        options=model.options,
-        doubts=find_doubts(model.options, laws.hand.joint_names, contacts, forces, stability, False, {}),
+        options=o,
+        doubts=find_doubts(o, hand.joint_names, contacts, forces, stability, reused=False, measured={}),
     )

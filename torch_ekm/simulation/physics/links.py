@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ...description import HandDescription
+from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...description.urdf import UrdfJoint, UrdfLink
 from ...exceptions import DescriptionError
@@ -35,7 +35,7 @@ class MovingLink:
     def shapes(self) -> Iterator[tuple[Array, Shape, str]]:
         """Frame in this link's, shape, and the name of the URDF's link to which it belongs."""
         for placed, piece in self.pieces:
-            yield from ((placed @ shape.transform, shape, piece.name) for shape in piece.collisions)
+            yield from ((placed @ one.transform, as_capsule(one), piece.name) for one in piece.collisions)
 
     def body(self) -> tuple[float, Array, Array]:
         """Mass [kg], centre of mass [m] and inertia about it [kg m^2], in this link's frame."""
@@ -48,6 +48,17 @@ class MovingLink:
             about_frame += rotation @ piece.inertia @ rotation.T + piece.mass * _steiner(centre)
         com = first / mass if mass > 0 else first
         return mass, com, about_frame - mass * _steiner(com)
+
+
+def as_capsule(shape: Shape) -> Shape:
+    """A cylinder with caps, which stick out by its radius: PhysX has no other whose side is smooth."""
+    return replace(shape, kind="capsule") if shape.kind == "cylinder" else shape
+
+
+def shapes_of(obj: ObjectDescription) -> list[Shape]:
+    """Those of an object alone have caps, where nothing grasps; where a broader part begins, fingers come to
+    the ends of cylinders."""
+    return [as_capsule(shape) if len(obj.shapes) == 1 else shape for shape in obj.shapes]
 
 
 def moving_links(hand: HandDescription) -> list[MovingLink]:

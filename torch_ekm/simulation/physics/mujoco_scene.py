@@ -11,7 +11,7 @@ from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...typing import Array
-from .links import ARMATURE, JOINT_DAMPING, moving_links, principal
+from .links import ARMATURE, JOINT_DAMPING, moving_links, principal, shapes_of
 
 _FIXED = 1e6  # [kg] and [kg m^2] added to an object that is held
 _LEAST_MASS, _LEAST_INERTIA = 1e-6, 1e-10  # of links without mass: MuJoCo takes no zeros
@@ -95,20 +95,15 @@ class MujocoScene:
                 body.add_joint(type=kinds.mjJNT_SLIDE, axis=axis)
             body.add_joint(type=kinds.mjJNT_HINGE, axis=self._normal)
         names = [f"object/{k}" for k in range(len(obj.shapes))]
-        for name, shape in zip(names, obj.shapes, strict=True):
-            self._add_shape(body, name, shape.transform, shape, flat=len(obj.shapes) > 1)
+        for name, shape in zip(names, shapes_of(obj), strict=True):
+            self._add_shape(body, name, shape.transform, shape)
         return names
 
-    def _add_shape(self, body: Any, name: str, at: Array, shape: Shape, flat: bool = False) -> None:
-        """``flat``: a cylinder's ends are, as where a broader part of an object begins."""
-        kinds = self._mj.mjtGeom
-        if shape.kind == "box":
-            kind, size = kinds.mjGEOM_BOX, np.array(shape.size) / 2
-        elif shape.kind == "sphere":
-            kind, size = kinds.mjGEOM_SPHERE, np.array([shape.size[0], 0.0, 0.0])
-        else:  # else cylinders are capsules, as in SAPIEN: the side is the same
-            kind = kinds.mjGEOM_CYLINDER if flat and shape.kind == "cylinder" else kinds.mjGEOM_CAPSULE
-            size = np.array([shape.size[0], shape.size[1] / 2, 0.0])
+    def _add_shape(self, body: Any, name: str, at: Array, shape: Shape) -> None:
+        kind, size = getattr(self._mj.mjtGeom, f"mjGEOM_{shape.kind.upper()}"), np.zeros(3)
+        size[: len(shape.size)] = np.array(shape.size) / 2
+        if shape.kind != "box":
+            size[0] = shape.size[0]  # the radius
         quaternion = self._quaternion(at[:3, :3])
         body.add_geom(
             name=name, type=kind, size=size, pos=at[:3, 3], quat=quaternion, contype=0, conaffinity=0

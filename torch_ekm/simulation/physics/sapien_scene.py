@@ -13,7 +13,7 @@ from ...description import HandDescription, ObjectDescription
 from ...description.shape import Shape
 from ...exceptions import ParameterError
 from ...typing import Array
-from .links import ARMATURE, JOINT_DAMPING, moving_links, principal, x_axis_to
+from .links import ARMATURE, JOINT_DAMPING, moving_links, principal, shapes_of, x_axis_to
 
 _TOLERANCE_LENGTH = 0.02  # [m] size of the things simulated; PhysX's defaults are for furniture
 _TOLERANCE_SPEED = 0.1  # [m/s]
@@ -129,8 +129,8 @@ class SapienScene:
         entity = self._sapien.Entity()
         entity.name = obj.name
         self._object: Any = self._physx.PhysxRigidDynamicComponent()
-        for shape in obj.shapes:
-            self._attach(self._object, shape.transform, shape, group=0, flat=len(obj.shapes) > 1)
+        for shape in shapes_of(obj):
+            self._attach(self._object, shape.transform, shape, group=0)
         self._object.linear_damping = self._object.angular_damping = 0.0
         entity.add_component(self._object)
         self._scene.add_entity(entity)
@@ -142,13 +142,12 @@ class SapienScene:
                 raise ParameterError("planar_normal", tuple(hand.planar_normal), valid)
             self._object.set_locked_motion_axes([*across.tolist(), *(~across).tolist()])
 
-    def _attach(self, body: Any, placed: Array, shape: Shape, group: int, flat: bool = False) -> Any:
-        """``flat``: a cylinder's ends are, as where a broader part of an object begins."""
+    def _attach(self, body: Any, placed: Array, shape: Shape, group: int) -> Any:
         if shape.kind == "box":
             built = self._physx.PhysxCollisionShapeBox(np.array(shape.size) / 2, self._material)
         elif shape.kind == "sphere":
             built = self._physx.PhysxCollisionShapeSphere(shape.size[0], self._material)
-        elif flat and shape.kind == "cylinder":
+        elif shape.kind == "cylinder":
             # PhysX has no smooth cylinder: its own has 32 flat sides, this one as many as it takes
             turns, (radius, length) = 2 * np.pi * np.arange(_SIDES) / _SIDES, shape.size
             radius /= np.sqrt(np.cos(np.pi / _SIDES))  # sides are as much inside as edges are outside
@@ -156,7 +155,6 @@ class SapienScene:
             corners, scale = _FINE * np.concatenate([rim, rim * (1, 1, -1)]), np.full(3, 1 / _FINE)
             built = self._physx.PhysxCollisionShapeConvexMesh(corners, scale, self._material)
         else:
-            # a capsule has a cylinder's smooth side; its caps stick out by a radius, where nothing grasps
             radius, length = shape.size
             built = self._physx.PhysxCollisionShapeCapsule(radius, length / 2, self._material)
             placed = placed @ x_axis_to(np.array([0.0, 0.0, 1.0]))
