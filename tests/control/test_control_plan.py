@@ -6,6 +6,7 @@ import copy
 import dataclasses
 import math
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -199,14 +200,26 @@ def test_a_waypoint_at_which_a_finger_may_slide_is_not_safe(held, loop, target) 
     plan = loop.plan(target)
     first, last = plan.waypoints[0], plan.waypoints[1]
     last = dataclasses.replace(last, band=dataclasses.replace(last.band, force=last.band.force + 3.0))
-    spare = first.piece.margin.new_full(first.piece.margin.shape, 10.0)
     need = 2 * last.piece.linearization.contacts.friction.mean() * last.band.force_std
+    spare = torch.full_like(need, 10.0)
     for share, safe in ((1.1, True), (0.9, False)):
-        piece = dataclasses.replace(last.piece, margin=share * need)
-        path = [first, dataclasses.replace(last, piece=piece)]
-        against = WholeTurn()._against(path, math.inf, spare)
+        hand = SimpleNamespace(margin=share * need)
+        against = WholeTurn()._against([first, last], math.inf, hand, spare)
         assert ("slide" not in against) is safe
-        assert "slide" not in WholeTurn()._against(path, math.inf, 0.8 * need)  # it had none to spare
+        # it had none to spare
+        assert "slide" not in WholeTurn()._against([first, last], math.inf, hand, 0.8 * need)
+
+
+def test_margins_of_a_hand_whose_forces_are_not_learned_change_as_it_moves(held, target) -> None:
+    seen, axis, model = held
+    controller = LookAndMoveController(model, axis)
+    hand = ModelHand(model, seen.state, seen.a, seen.fingertip_force)
+    spare = hand.margin
+    hand.command(controller.decide(seen.state, seen.a, target, seen.fingertip_force).delta_a)
+    grasp = model.linearize(hand.state, fingertip_force=hand.force, on_unstable="flag")
+    rows, pads = model.hand.pad_rows(grasp.contacts.finger)
+    assert (hand.margin - spare).abs().max() > 0.05
+    torch.testing.assert_close(hand.margin[pads], grasp.forces.margin[rows], rtol=0, atol=1e-9)
 
 
 def test_a_movement_is_no_longer_than_it_is_asked_to_be(loop, target) -> None:

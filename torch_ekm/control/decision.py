@@ -103,8 +103,6 @@ class Piece:
     """Normal forces after it [N]; None: not predicted."""
     said: Float[Tensor, " n_pads"]
     """Their change by the model alone, without what was learned of it [N]."""
-    margin: Float[Tensor, " n_pads"] | None = None
-    """``mu_s f_n - |f_t|`` after it, by the model [N]; None: not predicted."""
 
     @property
     def state(self) -> GraspState:

@@ -66,7 +66,7 @@ class ModelHand:
         """Of the last motion, and g's part of it [rad, m, rad]."""
         self.said = self.a.new_zeros(len(self.hand.pads))
         """Change of the normal forces in it, by the model alone [N]."""
-        self._spare = self.said
+        self._spare, self._is_stale = self.said, False
         self._bears = self.said  # what the model thinks that the pads bear: other than they measure
         self._measured, self._stands = force is not None, False
         self.force = self.a.new_zeros(len(self.hand.pads)) if force is None else force
@@ -99,8 +99,11 @@ class ModelHand:
 
     @property
     def margin(self) -> Float[Tensor, " n_pads"]:
-        """``mu_s f_n - |f_t|`` of each pad here [N]."""
+        """``mu_s f_n - |f_t|`` of each pad here, as a reading would give it [N]."""
         self._stand()
+        if self._is_stale:
+            with contextlib.suppress(GraspError):
+                self._see()
         return self._spare
 
     def tangent(self, w: Float[Tensor, " n_a"]) -> tuple[Tensor, Tensor] | None:
@@ -139,18 +142,25 @@ class ModelHand:
             return
         self._stands = True
         try:
-            force = self.force if self._measured else None
-            contacts = self.kinematic.touching(self.state, force)
-            lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
+            lin = self._see()
             if not lin.forces.solved:
                 self.failure = GraspEndsError(str(lin.doubts[0]))
             self._motion = ContactMotion(self.kinematic, lin)
             self._linearization = self._motion.answered(lin)
-            names = lin.contacts.finger
-            self._bears = self._of_pads(dict(zip(names, lin.forces.normal.tolist(), strict=True)))
-            self._spare = self._of_pads(dict(zip(names, lin.forces.margin.tolist(), strict=True)))
+            self._bears = self._of_pads(
+                dict(zip(lin.contacts.finger, lin.forces.normal.tolist(), strict=True))
+            )
         except GraspError as error:
             self.failure = error
+
+    def _see(self) -> Linearization:
+        """The grasp as a reading here would give it, and the margins in it."""
+        force = self.force if self._measured else None
+        contacts = self.kinematic.touching(self.state, force)
+        lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
+        self._spare = self._of_pads(dict(zip(lin.contacts.finger, lin.forces.margin.tolist(), strict=True)))
+        self._is_stale = False
+        return lin
 
     def _move(self, w: Tensor, motion: ContactMotion) -> None:
         correction = None
@@ -169,6 +179,7 @@ class ModelHand:
         self.state, self.a = motion.state, self.a + w
         bears = self._of_pads(step.normal)
         before, self.said, self._bears = self.force, bears - self._bears, bears
+        self._is_stale = True
         self.force = bears
         if self._measured:
             least = self.kinematic.options.forces.normal_std

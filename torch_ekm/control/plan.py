@@ -177,7 +177,7 @@ class WholeTurn:
         safe, against, nearest = 0, "", (asked, 0)
         for waypoint in rehearsal.path():
             waypoints.append(waypoint)
-            against = against or self._against(waypoints, most, spare)
+            against = against or self._against(waypoints, most, rehearsal.hand, spare)
             if len(waypoints) == 1:
                 against = against or lets_go(rehearsal.hand.hand, waypoint.piece, self.deviations)
             safe += not against
@@ -200,9 +200,9 @@ class WholeTurn:
             decision = self._first_order(controller, seen, target)
         return Plan(target, focus, seen.state, decision, tuple(waypoints), safe, end, against)
 
-    def _against(self, path: Sequence[Waypoint], most: float, spare: Tensor) -> str:
-        """Why the last of some waypoints is not safe; empty: it is. ``spare`` is ``mu_s f_n - |f_t|`` of each
-        pad before the first [N]."""
+    def _against(self, path: Sequence[Waypoint], most: float, hand: ModelHand, spare: Tensor) -> str:
+        """Why the last of some waypoints, at which the hand stands, is not safe; empty: it is. ``spare`` is
+        ``mu_s f_n - |f_t|`` of each pad before the first [N]."""
         band, piece, first = path[-1].band, path[-1].piece, len(path) == 1
         off = self._off(band, most + (self.margin if first else 0.0))
         if off or first or band.force is None or band.force_std is None:
@@ -210,11 +210,9 @@ class WholeTurn:
         low = (band.force - self.deviations * band.force_std).nan_to_num(nan=math.inf)
         if bool((low < self.force).any()):
             return f"a finger may keep only {float(low.min()):.1f} N"
-        if piece.margin is None:
-            return ""
         friction = piece.linearization.contacts.friction.mean()
         least = torch.minimum(self.deviations * friction * band.force_std, spare)
-        slides = (piece.margin < least) & ~band.force.isnan()
+        slides = (hand.margin < least) & ~band.force.isnan()
         return "a finger may slide" if bool(slides.any()) else ""
 
     def _off(self, band: Band, most: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Iterator
 from enum import Enum
@@ -203,7 +204,8 @@ class Rehearsal:
         self.first: Decision | None = None
         """The first one, with the grip before anything moves."""
         self.last: Decision | None = None
-        self._too_long, self._most = False, math.inf  # the hardest grip [N]
+        self._too_long = False
+        self._start: Linearization | None = None
 
     @torch.no_grad()
     def path(self) -> Iterator[Waypoint]:
@@ -219,9 +221,7 @@ class Rehearsal:
             force = controller.believed(here.a, here.fingertip_force if self._measures else None)
             share = _GRIPPED
             if self.first is None:
-                share = min(share, self._firm)
-                if softened(hand.kinematic, lin):  # by its forces: with more it would buckle
-                    self._most = float(lin.forces.normal.max())
+                share, self._start = min(share, self._firm), lin
             lin = controller.corrected(lin)
             self.last = decision = self._decide(here, force, lin)
             self.first = self.first or decision
@@ -235,7 +235,7 @@ class Rehearsal:
             hand.command(decision.delta_a)
             if hand.failure is None:
                 f, after = hand.increment - hand.correction, hand.force if self._measures else None
-                made = Piece(lin, decision.delta_a, f, hand.increment, after, hand.said, hand.margin)
+                made = Piece(lin, decision.delta_a, f, hand.increment, after, hand.said)
                 yield Waypoint(made, hand.state, self._bands.add(made, hand.state))
 
     def _decide(self, here: Observation, force: Tensor | None, lin: Linearization) -> Decision:
@@ -245,7 +245,7 @@ class Rehearsal:
         desired = self._limiting(focus.step_scale * (focus.matrix @ error)) / focus.step_scale
         for _ in range(_HALVES):
             seen = controller.situation(lin, here.a, force, error, desired)
-            if seen.grip is not None:
+            if seen.grip is not None and self._start and seen.grip > float(self._start.forces.normal.max()):
                 seen = dataclasses.replace(seen, grip=min(seen.grip, self._most))
             decision = controller.choose(lin, seen)
             if not any(lets_go(self.hand.hand, piece) for piece in decision.pieces):
@@ -260,6 +260,13 @@ class Rehearsal:
             return decision
         again = dataclasses.replace(lin, manipulation_jacobian=J)
         return controller.choose(again, dataclasses.replace(seen, bend=rest))
+
+    @functools.cached_property
+    def _most(self) -> float:
+        """The hardest grip [N]: a grasp that its forces have made soft would buckle with more."""
+        lin = self._start
+        soft = lin is not None and softened(self.hand.kinematic, lin)
+        return float(lin.forces.normal.max()) if soft else math.inf
 
     def _there(self, state: GraspState) -> bool:
         return self._target is not None and self._controller.focus.error(self._target, state) <= _THERE

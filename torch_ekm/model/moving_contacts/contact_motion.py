@@ -154,6 +154,7 @@ class ContactMotion:
         self._count_gaps(absolute=a is not None)
         still = np.zeros(laws.S.shape[1])
         self._load = still if a is not None else laws.unbalance(self._grasp, self.loads)
+        self._is_settled = True
 
     def __copy__(self) -> ContactMotion:
         made = object.__new__(ContactMotion)
@@ -186,6 +187,7 @@ class ContactMotion:
             NoContactError: nothing touches the object any more.
             GraspEndsError: no equilibrium is found: the object slips away. The motion stands where it began.
         """
+        self._settle()
         start = self._start
         before, names = (self.state, self._placed, self.loads, self._near), start.grasp.contacts.finger
         way, slid = delta_a.detach().double().numpy(), dict[str, float]()
@@ -218,6 +220,7 @@ class ContactMotion:
             NoContactError: nothing bears.
             GraspEndsError: no equilibrium is near.
         """
+        self._settle()
         grasp, loads, still = self._grasp, self.loads, np.zeros(self._laws.S.shape[1])
         done = self._solve(grasp, loads, Way(grasp, loads.pull, delta_a.detach().double().numpy(), still))
         if done is None:
@@ -245,8 +248,13 @@ class ContactMotion:
         by the least motion that lets no contact that bears open or slide."""
         follow = self._grasp.follow(increment.numpy(), self.loads)
         self._stand(self.state.plus(increment + torch.from_numpy(follow)), None, self.loads)
-        self._count_gaps(absolute=False)
-        self._load = self._laws.unbalance(self._grasp, self.loads)
+        self._is_settled = False
+
+    def _settle(self) -> None:
+        """After a shift, once a motion begins here: gaps and the load that balances the forces."""
+        if not self._is_settled:
+            self._count_gaps(absolute=False)
+            self._load, self._is_settled = self._laws.unbalance(self._grasp, self.loads), True
 
     def _count_gaps(self, *, absolute: bool) -> None:
         """From where gaps are counted [m]: one that overlaps, or bears in the incremental form, is closed."""
