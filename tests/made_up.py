@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from torch_ekm.kinematics import se3
+from torch_ekm.kinematics.poses import exp
 from torch_ekm.plant import Observation, PlantStatus, Trajectory, Truth
 
 
@@ -26,7 +26,7 @@ def trajectory(seed: int, n: int = 3, n_a: int = 2) -> Trajectory:
         }
         if k == 1:
             info["events"] = ("a tendon slipped",)
-        q, a, position, rotation = some(4), some(n_a), some(3), se3.exp(some(3))
+        q, a, position, rotation = some(4), some(n_a), some(3), exp(some(3))
         status = PlantStatus.LOST if k == n else PlantStatus.HELD
         truth = Truth(q + 0.01, position, rotation)
         reading = q, a, position, rotation, some(2), 0.1 * k**2 + 0.3

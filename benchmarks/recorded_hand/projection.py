@@ -13,7 +13,7 @@ from torch_ekm.contact.contact_kinematics import constraint_matrix
 from torch_ekm.contact.contact_set import ContactSet
 from torch_ekm.contact.detector import ContactDetector
 from torch_ekm.exceptions import SolverError, UnknownNameError
-from torch_ekm.kinematics.grasp_state import GraspState
+from torch_ekm.kinematics.poses import GraspState
 from torch_ekm.model.kinematic_model import KinematicModel
 from torch_ekm.typing import Tensor
 

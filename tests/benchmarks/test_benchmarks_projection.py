@@ -13,11 +13,11 @@ pytest.importorskip("coal")
 
 from recorded_hand.projection import project_onto_contacts
 
+from torch_ekm._arrays import null_space
 from torch_ekm.contact import constraint_matrix
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import EKMError, UnknownNameError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.kinematics.tensors import null_space
 from torch_ekm.model import KinematicModel
 
 pytestmark = pytest.mark.usefixtures("unchecked")  # states of lists

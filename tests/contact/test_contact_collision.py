@@ -16,7 +16,7 @@ from torch_ekm.contact.signed_distance import point_distance, surface_curvature,
 from torch_ekm.description import ContactPad, ObjectDescription, Shape, load_hand, load_object
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.kinematics.se3 import exp
+from torch_ekm.kinematics.poses import exp
 
 coal = pytest.importorskip("coal")
 import torch_ekm.contact.detector  # noqa: E402

@@ -18,7 +18,7 @@ from torch_ekm.contact.contact_kinematics import (
     selected_rows,
 )
 from torch_ekm.contact.grasp_analysis import analyse
-from torch_ekm.kinematics.se3 import exp
+from torch_ekm.kinematics.poses import exp
 
 
 def test_contact_frames_are_rotations_with_the_inward_normal_first():

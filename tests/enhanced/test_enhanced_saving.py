@@ -16,7 +16,7 @@ import torch
 import torch_ekm
 from torch_ekm import exceptions
 from torch_ekm.enhanced import EnhancedModel, GraspEncoding
-from torch_ekm.kinematics.grasp_state import GraspState
+from torch_ekm.kinematics.poses import GraspState
 from torch_ekm.residual import (
     ActionLinearKernel,
     DeepKernelSOGP,

@@ -11,7 +11,7 @@ import torch
 from torch_ekm._noise import NOISE
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.foresight import BlindPose, blind_pose
-from torch_ekm.kinematics.se3 import exp
+from torch_ekm.kinematics.poses import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, Plant, PlantStatus, PlantWrapper
 from torch_ekm.simulation import SimulatedHand

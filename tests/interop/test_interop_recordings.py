@@ -14,7 +14,7 @@ from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, 
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.interop import log_to_lerobot, log_to_mcap, read_bag
 from torch_ekm.interop.bags import _numbers
-from torch_ekm.kinematics import se3
+from torch_ekm.kinematics import poses
 from torch_ekm.plant import Observation, Trajectory, TrialLog
 
 AnyReader = pytest.importorskip("rosbags.highlevel", reason="extra 'interop'").AnyReader
@@ -62,7 +62,7 @@ def test_a_recording_is_a_table(tmp_path: Path) -> None:
     for k, seen in enumerate(one.observations[:5]):
         half = np.arccos(np.clip(w[k], -1, 1))
         axis = np.array([x[k], y[k], z[k]]) / np.sin(half)
-        turned = se3.exp(torch.from_numpy(2 * half * axis))
+        turned = poses.exp(torch.from_numpy(2 * half * axis))
         torch.testing.assert_close(turned, seen.rotation, rtol=0, atol=1e-9)
     (file,) = bag.glob("*.mcap")
     assert np.array_equal(read_bag(file, "/commands", ["/q", "/object_pose"]).values, table.values)
@@ -116,7 +116,7 @@ def frames(log: TrialLog) -> list[tuple[Observation, torch.Tensor]]:
 
 
 def same(row, seen: Observation, command: torch.Tensor) -> None:
-    pose = torch.cat([seen.position, se3.log(seen.rotation)])
+    pose = torch.cat([seen.position, poses.log(seen.rotation)])
     for name, value in (
         ("action", command),
         ("observation.state", torch.cat([seen.q, seen.a])),

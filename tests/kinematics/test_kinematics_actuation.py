@@ -15,10 +15,10 @@ import torch
 from made_hands import write_hand
 from mk3 import distal_angle
 
+from torch_ekm._arrays import null_space
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import ParameterError, ShapeError
 from torch_ekm.kinematics import ActuationMap, Play
-from torch_ekm.kinematics.tensors import null_space
 from torch_ekm.simulation import PlantParameters
 from torch_ekm.simulation.mechanism.servo import Servo
 

@@ -14,7 +14,7 @@ from torch_ekm.contact.contact_kinematics import ContactKinematics, constraint_m
 from torch_ekm.contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
 from torch_ekm.contact.forces.problem import ForceStatus, friction_cones, margins
 from torch_ekm.exceptions import EquilibriumError
-from torch_ekm.kinematics.grasp_state import GraspState
+from torch_ekm.kinematics.poses import GraspState
 from torch_ekm.model.force_balance import ForceBalance, pack_forces
 from torch_ekm.model.grasp_forces import GraspForces
 from torch_ekm.model.kinematic_model import KinematicModel

@@ -16,7 +16,8 @@ from torch_ekm.contact.contact_kinematics import constraint_matrix
 from torch_ekm.contact.contact_set import SHARED, VARYING, ContactSet
 from torch_ekm.description import Actuator, HandDescription
 from torch_ekm.description.urdf import UrdfModel
-from torch_ekm.kinematics import GraspState, LinkPoses, se3
+from torch_ekm.kinematics import GraspState, LinkPoses
+from torch_ekm.kinematics.poses import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.model.stiffness import gravity_gradient
 
@@ -46,7 +47,7 @@ class ChainKinematics(nn.Module):
     def forward(self, q):
         turns = torch.zeros(*q.shape, 4, 4, dtype=F64)
         turns[..., 3, 3] = 1
-        turns[..., :3, :3] = se3.exp(q[..., None] * self.axes)
+        turns[..., :3, :3] = exp(q[..., None] * self.axes)
         rows = []
         for joints in (self.origins @ turns).split(self.lengths, dim=-3):
             T = torch.eye(4, dtype=F64)

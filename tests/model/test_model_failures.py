@@ -24,7 +24,7 @@ from torch_ekm.contact import ForceStatus
 from torch_ekm.contact.contact_kinematics import constraint_matrix
 from torch_ekm.exceptions import NoContactError, PenetrationError, SingularGraspError, UnstableGraspError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.kinematics.se3 import exp
+from torch_ekm.kinematics.poses import exp
 from torch_ekm.model import KinematicModel, ModelStatus
 from torch_ekm.model.manipulation import two_stage
 

@@ -22,7 +22,7 @@ from model_toys import (
 )
 
 from torch_ekm.contact.contact_kinematics import contact_frames
-from torch_ekm.kinematics.se3 import exp
+from torch_ekm.kinematics.poses import exp
 
 STEP = 2e-5  # [rad] of a motor
 

@@ -11,7 +11,7 @@ from made_hands import write_hand
 from model_toys import batch_of, stacked
 
 from torch_ekm.description import load_hand, load_object
-from torch_ekm.kinematics.grasp_state import GraspState
+from torch_ekm.kinematics.poses import GraspState
 from torch_ekm.model import ContactMotion, KinematicModel
 from torch_ekm.simulation import PlantConfig, PlantParameters
 from torch_ekm.simulation.grasp_planning.pinch import PinchRequest, pinch_problem, plan_pinch

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
-from torch_ekm.kinematics.se3 import exp, log
+from torch_ekm.kinematics.poses import exp, log
 from torch_ekm.sensing import MarkerBoard, PinholeCamera
 from torch_ekm.sensing.vision import board_pose
 from torch_ekm.sensing.vision.board_pose import estimate_board_pose, projection_jacobian

@@ -8,7 +8,7 @@ from enum import Enum
 from functools import cached_property
 
 from .._arrays import eye, like, namespace, zeros
-from ..kinematics.se3 import cross, hat
+from ..kinematics.poses import cross, hat
 from ..typing import AnyArray, Bool, Float
 from .contact_set import ContactSet
 

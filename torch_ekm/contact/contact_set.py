@@ -9,8 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
+from .._arrays import as_tensors
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
-from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 
 CHARACTERISTIC_LENGTH = 0.03

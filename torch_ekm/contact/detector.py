@@ -19,7 +19,7 @@ from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import DescriptionError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
-from ..kinematics.hand_kinematics import Kinematics
+from ..kinematics.poses import Kinematics
 from ..typing import Array, Float, Tensor
 from .contact_set import LINK_MARGIN, ContactSet, NearMiss
 from .pad_contact import LinkShapes, PadContact, Solid, pad_contact, pad_shape

@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 import torch
 
+from .._arrays import as_tensors
 from .._checks import check_count, check_finite, check_kind, check_shape
 from .._recorded import check_state
 from ..exceptions import FileFormatError, OutputError, ResumeError
-from ..kinematics.tensors import as_tensors
 from ..plant import Observation, PlantStatus
 from ..residual.files import read, write
 from .closed_loop import ClosedLoop

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from .._arrays import as_tensors
 from .._checks import check_finite, check_kind, check_shape
 from ..description import HandDescription
 from ..exceptions import BusError, CommandRefusedError, NeverAtRestError, StaleReadingError
-from ..kinematics.tensors import as_tensors
 from ..plant import Observation, PlantStatus, Stamps
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor

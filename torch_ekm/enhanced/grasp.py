@@ -9,7 +9,7 @@ import torch
 from .._checks import check_kind
 from .._recorded import Recorded
 from ..exceptions import NoContactError, UnknownNameError
-from ..kinematics.grasp_state import A_STATE, GraspState
+from ..kinematics.poses import A_STATE, GraspState
 from ..residual import ActionLinearKernel, ForgettingFactor, RobustWeight, SparseOnlineGP, SquaredExponential
 from ..typing import Float, Tensor
 

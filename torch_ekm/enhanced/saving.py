@@ -10,7 +10,7 @@ from torch import nn
 
 from .._recorded import describe
 from ..exceptions import FileFormatError, NoStateError, ParameterError
-from ..kinematics.grasp_state import GraspState
+from ..kinematics.poses import GraspState
 from ..residual.base import ResidualLearner
 from ..residual.files import known_classes, read, rebuild, write
 from .enhanced_model import EnhancedModel

@@ -15,7 +15,7 @@ from ..description import HandDescription, list_hands, load_hand, load_object
 from ..description.registry import HAND_FILES
 from ..exceptions import DescriptionError, ParameterError, UnknownNameError
 from ..kinematics import ActuationMap, GraspState
-from ..kinematics.se3 import log as rotation_vector
+from ..kinematics.poses import log as rotation_vector
 from ..model import KinematicModel
 from ..plant import Observation, PlantStatus, Trajectory, TrialLog
 from ..rendering import Captions, Scene, make_scene

@@ -12,7 +12,7 @@ import torch
 from .._extras import require
 from .._files import make_folder, told_as_output_error
 from ..exceptions import ParameterError
-from ..kinematics import se3
+from ..kinematics import poses
 from ..plant import Trajectory, TrialLog
 
 _FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -87,7 +87,7 @@ def log_to_lerobot(log: TrialLog, folder: str | Path, task: str = "turn the obje
 def _frames(trajectory: Trajectory) -> dict[str, Any]:
     """What LeRobot's policies read, ``(n + 1, ...)`` for n commands."""
     arrays = trajectory.arrays()
-    a, turned = arrays["a"], se3.log(torch.from_numpy(arrays["rotation"]).double()).numpy()
+    a, turned = arrays["a"], poses.log(torch.from_numpy(arrays["rotation"]).double()).numpy()
     columns = {
         "action": np.concatenate([*arrays["commands"], np.zeros(a.shape[1])]).reshape(len(a), -1),
         "observation.state": np.concatenate([arrays["q"], a], axis=1),

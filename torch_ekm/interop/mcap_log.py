@@ -12,7 +12,7 @@ import numpy as np
 from .._extras import require
 from .._files import make_folder
 from ..exceptions import ParameterError
-from ..kinematics import se3
+from ..kinematics import poses
 from ..plant import Trajectory, TrialLog
 
 _typesys = require("rosbags.typesys")
@@ -100,7 +100,7 @@ def _joints(stamp: int, row: np.ndarray) -> Any:
 
 def _pose(stamp: int, position: Any, rotation: Any) -> Any:
     x, y, z = (float(one) for one in position)
-    phi = se3.log(rotation)
+    phi = poses.log(rotation)
     angle = float(phi.norm())
     i, j, k = (float(one) * (math.sin(0.5 * angle) / angle if angle else 0.5) for one in phi)
     point = _message("geometry_msgs/msg/Point", x=x, y=y, z=z)

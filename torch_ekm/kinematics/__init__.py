@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from .equilibrium import ActuationMap
-from .grasp_state import GraspState
-from .hand_kinematics import HandKinematics, LinkPoses
+from .poses import GraspState, HandKinematics, LinkPoses
 from .servo_model import Play, ServoModel
 
 __all__ = ["ActuationMap", "GraspState", "HandKinematics", "LinkPoses", "Play", "ServoModel"]

@@ -23,7 +23,7 @@ from .._extras import require
 from ..contact.contact_set import VARYING, ContactSet
 from ..contact.forces.problem import BalanceEquations, ForceOptions, ForceSolution, force_cost, force_problem
 from ..exceptions import NoContactError
-from ..kinematics.grasp_state import A_STATE, GraspState
+from ..kinematics.poses import A_STATE, GraspState
 from ..typing import Float, Tensor
 
 _NEAR = 1e-3  # [N] constraints with less room may be active: an interior-point method stays off them a little

@@ -15,8 +15,7 @@ from ..contact.contact_set import ContactSet, Detector
 from ..contact.detector import ContactDetector
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError
-from ..kinematics.grasp_state import A_STATE, GraspState
-from ..kinematics.hand_kinematics import HandKinematics, Kinematics, LinkPoses
+from ..kinematics.poses import A_STATE, GraspState, HandKinematics, Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
 from .arms import Arms, arms_at, bends, over_posture
 from .force_balance import ForceBalance

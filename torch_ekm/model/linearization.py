@@ -9,11 +9,10 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 
-from .._arrays import eye, in_numpy, in_torch, is_plain, like, norm, of_fields, zeros
+from .._arrays import as_tensors, eye, in_numpy, in_torch, is_plain, like, norm, of_fields, zeros
 from .._checks import check_finite, check_last
 from ..contact.contact_set import ContactSet
-from ..kinematics.grasp_state import GraspState
-from ..kinematics.tensors import as_tensors
+from ..kinematics.poses import GraspState
 from ..typing import AnyArray, Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
 from .motion_equations import Motion, MotionEquations

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import nn
 
-from .._arrays import eye, like, namespace, norm, zeros
+from .._arrays import eye, like, namespace, norm, null_space, zeros
 from ..contact.contact_kinematics import ContactKinematics, ContactModel
 from ..contact.contact_set import CHARACTERISTIC_LENGTH
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
-from ..kinematics.tensors import null_space
 from ..typing import AnyArray, Bool, Float, Tensor
 from .arms import SAME, Arms
 from .grasp_forces import GraspForces

@@ -6,7 +6,7 @@ from typing import Any
 
 from .._arrays import eye, like, namespace, zeros
 from ..contact.contact_kinematics import ContactKinematics
-from ..kinematics.se3 import cross, hat
+from ..kinematics.poses import cross, hat
 from ..typing import AnyArray, Bool, Float, Tensor
 
 

@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from .._arrays import like, namespace, norm
+from .._arrays import as_tensors, like, namespace, norm
 from .._checks import check_kind, check_last
 from ..contact.contact_set import LINK_MARGIN, ContactSet
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
-from ..kinematics.grasp_state import GraspState
-from ..kinematics.tensors import as_tensors
+from ..kinematics.poses import GraspState
 from ..typing import AnyArray, Float, Tensor
 from .grasp_forces import GraspForces, as_states
 from .options import ModelOptions

@@ -10,10 +10,10 @@ from typing import NoReturn
 
 import torch
 
+from .._arrays import as_tensors
 from .._checks import check_kind
 from ..description import HandDescription
 from ..exceptions import CommandRefusedError, ParameterError, PlantInUseError
-from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .observation import Observation, readable
 from .plant import Path, Plant, PlantWrapper, can_follow

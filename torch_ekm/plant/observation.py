@@ -16,7 +16,7 @@ from .._checks import check_finite, check_kind, check_shape
 from ..description import HandDescription
 from ..exceptions import ParameterError
 from ..kinematics import GraspState
-from ..kinematics.se3 import exp, log
+from ..kinematics.poses import exp, log
 from ..typing import Float, Tensor
 
 

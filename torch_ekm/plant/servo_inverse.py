@@ -4,11 +4,11 @@ from collections.abc import Callable
 
 import torch
 
+from .._arrays import as_tensors
 from .._checks import check_finite, check_kind, check_shape
 from ..description import HandDescription
 from ..kinematics import ServoModel
 from ..kinematics.servo_model import IdealServos
-from ..kinematics.tensors import as_tensors
 from ..typing import Float, Tensor
 from .gate import Gate
 from .observation import Observation

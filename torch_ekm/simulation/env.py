@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from .._extras import require
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import ParameterError, UnknownNameError
-from ..kinematics.se3 import log
+from ..kinematics.poses import log
 from ..plant import Observation, PlantStatus
 from ..rendering import Picture, make_scene
 from ..typing import Array

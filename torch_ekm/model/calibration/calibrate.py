@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..._extras import require
 from ..._noise import NOISE
 from ...exceptions import GraspError, StateError
-from ...kinematics.grasp_state import GraspState
+from ...kinematics.poses import GraspState
 from ...kinematics.servo_model import Play
 from ...typing import Array, Float, Tensor
 from ..kinematic_model import KinematicModel

@@ -14,8 +14,7 @@ import torch
 from ..._arrays import in_torch, of_fields
 from ...contact.detector import ContactDetector
 from ...exceptions import GraspEndsError, GraspError, NoContactError
-from ...kinematics.grasp_state import GraspState
-from ...kinematics.se3 import exp
+from ...kinematics.poses import GraspState, exp
 from ...typing import Array, Float, Tensor
 from .contact_laws import Response, StepSolution, solve
 from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp

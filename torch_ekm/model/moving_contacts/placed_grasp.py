@@ -16,9 +16,7 @@ from ...contact.contact_kinematics import (
 )
 from ...contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet, Detector
 from ...description.hand import HandDescription
-from ...kinematics.grasp_state import GraspState
-from ...kinematics.hand_kinematics import Kinematics, LinkPoses
-from ...kinematics.se3 import hat
+from ...kinematics.poses import GraspState, Kinematics, LinkPoses, hat
 from ...typing import AnyArray, Array, Tensor
 from ..arms import arms_at, bends
 from ..linearization import FollowedFigures

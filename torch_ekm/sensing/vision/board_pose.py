@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..._extras import require
-from ...kinematics.se3 import hat
+from ...kinematics.poses import hat
 from ...typing import Array
 from .board import MarkerBoard
 from .camera import PinholeCamera

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ObjectLostError, ParameterError, ShapeError
-from ...kinematics.se3 import hat
+from ...kinematics.poses import hat
 from ...typing import Array, Float, Tensor
 from .board import MarkerBoard, get_dictionary
 from .board_pose import BoardPose, angle_between, estimate_board_pose

@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from ..._arrays import null_space
 from ..._extras import require
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import EquilibriumError, ParameterError
 from ...kinematics import HandKinematics
-from ...kinematics.tensors import null_space
 from ...typing import Array
 from ..config import PlantConfig
 from ..mechanism.assembly import chain, make_transmission, true_object

@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..._arrays import null_space
 from ...contact import signed_distance
 from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics
 from ...kinematics.equilibrium import FreeHand
-from ...kinematics.se3 import cross, exp
-from ...kinematics.tensors import null_space
+from ...kinematics.poses import cross, exp
 from ...typing import Array
 from ..mechanism.assembly import chain
 from ..mechanism.transmission import Transmission
