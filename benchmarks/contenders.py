@@ -16,7 +16,7 @@ from typing import Any
 
 from sessions import axes_of
 
-from torch_ekm.contact.contact_kinematics import ContactKinematics
+from torch_ekm.contact.contacts import ContactKinematics
 from torch_ekm.control import (
     DEFAULT_TASKS,
     ActuatorLimit,

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from torch_ekm.contact.contact_set import VARYING
+from torch_ekm.contact.contacts import VARYING
 from torch_ekm.description import HandDescription
 from torch_ekm.estimation.hand_figures import HandFigures
 from torch_ekm.exceptions import GraspError

@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import torch
 
-from torch_ekm.contact.contact_kinematics import constraint_matrix
-from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.contact.contacts import ContactSet, constraint_matrix
 from torch_ekm.contact.detector import ContactDetector
 from torch_ekm.exceptions import SolverError, UnknownNameError
 from torch_ekm.kinematics.poses import GraspState

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from torch_ekm.contact import ContactSet
-from torch_ekm.contact.contact_set import VARYING
+from torch_ekm.contact.contacts import VARYING
 from torch_ekm.description import HandDescription, ObjectDescription, Shape, load_object
 from torch_ekm.exceptions import EKMError
 from torch_ekm.kinematics import GraspState

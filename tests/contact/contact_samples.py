@@ -6,8 +6,7 @@ import dataclasses
 
 import torch
 
-from torch_ekm.contact.contact_kinematics import ContactKinematics, ContactModel, contact_kinematics
-from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.contact.contacts import ContactKinematics, ContactModel, ContactSet, contact_kinematics
 
 F64 = torch.float64
 RADIUS = 0.03

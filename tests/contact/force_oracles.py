@@ -6,7 +6,7 @@ import clarabel
 import numpy as np
 from scipy import sparse
 
-from torch_ekm.contact.forces.problem import BalanceEquations, ForceOptions, force_cost, force_problem
+from torch_ekm.contact.forces import BalanceEquations, ForceOptions, force_cost, force_problem
 
 
 def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> np.ndarray | None:
@@ -14,7 +14,7 @@ def cone_program(eq: BalanceEquations, options: ForceOptions | None = None) -> n
     n_h = eq.object_matrix.shape[1]
     options = options or ForceOptions()
     cost = force_cost(eq, options)
-    problem, scale = force_problem(eq, cost, np.zeros((0, n_h))), cost.scale
+    problem, scale = force_problem(eq, cost), cost.scale
     n = len(problem.q)
     up, low = np.isfinite(problem.ub), np.isfinite(problem.lb)
     eye = np.eye(n)

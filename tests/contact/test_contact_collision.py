@@ -12,7 +12,7 @@ import torch
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
-from torch_ekm.contact.signed_distance import point_distance, surface_curvature, tangents
+from torch_ekm.contact.pad_contact import point_distance, surface_curvature, tangents
 from torch_ekm.description import ContactPad, ObjectDescription, Shape, load_hand, load_object
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics

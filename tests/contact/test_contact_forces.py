@@ -10,10 +10,9 @@ import qpsolvers
 from contact_samples import THREE, held
 from force_oracles import cone_program, gaussian_posterior
 
+from torch_ekm._arrays import EqualityProgram, solve_by_active_set
 from torch_ekm.contact import ForceOptions, ForceStatus, contact_forces, grasp_matrix, hand_jacobian
-from torch_ekm.contact.forces import problem, solve
-from torch_ekm.contact.forces.problem import BalanceEquations, friction_cones, margins
-from torch_ekm.contact.forces.solve import EqualityProgram, solve_by_active_set
+from torch_ekm.contact.forces import BalanceEquations, friction_cones, margins
 from torch_ekm.exceptions import ParameterError
 
 WEIGHT = np.array([0.0, 0.0, -9.81 * 0.25, 0.0, 0.0, 0.0])
@@ -165,8 +164,7 @@ def test_bad_options_are_refused(bad):
 
 
 def bound_normals(monkeypatch, most):
-    for module in (problem, solve):
-        monkeypatch.setattr(module, "MAX_NORMAL", most)
+    monkeypatch.setattr("torch_ekm.contact.forces.MAX_NORMAL", most)
 
 
 def test_soft_finger_bears_spin_up_to_its_coefficient(monkeypatch):

@@ -6,8 +6,9 @@ import pytest
 import torch
 from contact_samples import F64, RADIUS, THREE, ball_contacts, held
 
-from torch_ekm.contact.contact_kinematics import (
+from torch_ekm.contact.contacts import (
     ContactModel,
+    analyse,
     constraint_matrix,
     contact_frames,
     full_grasp_matrix,
@@ -17,7 +18,6 @@ from torch_ekm.contact.contact_kinematics import (
     rolling_mobility,
     selected_rows,
 )
-from torch_ekm.contact.grasp_analysis import analyse
 from torch_ekm.kinematics.poses import exp
 
 

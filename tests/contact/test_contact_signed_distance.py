@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from torch_ekm.contact.signed_distance import point_distance, signed_distance
+from torch_ekm.contact.pad_contact import point_distance, signed_distance
 from torch_ekm.description.shape import Shape
 from torch_ekm.simulation.physics.links import x_axis_to
 

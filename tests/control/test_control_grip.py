@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ekm.contact.forces.problem import ForceStatus
+from torch_ekm.contact.forces import ForceStatus
 from torch_ekm.control import (
     ClosedLoop,
     GripForceTask,

@@ -45,7 +45,7 @@ def support(shape: Shape, direction: np.ndarray) -> float:
 @pytest.mark.parametrize("name", list_objects())
 def test_grasp_width_is_the_width_at_the_origin(name: str) -> None:
     """How long the line along the grasp axis through the origin is inside the object."""
-    from torch_ekm.contact.signed_distance import signed_distance
+    from torch_ekm.contact.pad_contact import signed_distance
 
     obj = load_object(name)
     along = np.linspace(-0.05, 0.05, 20001)

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from surface import TrackedContacts
 
-from torch_ekm.contact.contact_kinematics import ContactKinematics, constraint_matrix
-from torch_ekm.contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from torch_ekm.contact.forces.problem import ForceStatus, friction_cones, margins
+from torch_ekm.contact.contacts import CHARACTERISTIC_LENGTH, ContactKinematics, ContactSet, constraint_matrix
+from torch_ekm.contact.forces import ForceStatus, friction_cones, margins
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics.poses import GraspState
 from torch_ekm.model.force_balance import ForceBalance, pack_forces

@@ -12,8 +12,7 @@ from equilibrium import Equilibrium, EquilibriumSolver, known_forces
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from torch_ekm.contact.contact_kinematics import constraint_matrix
-from torch_ekm.contact.contact_set import SHARED, VARYING, ContactSet
+from torch_ekm.contact.contacts import SHARED, VARYING, ContactSet, constraint_matrix
 from torch_ekm.description import Actuator, HandDescription
 from torch_ekm.description.urdf import UrdfModel
 from torch_ekm.kinematics import GraspState, LinkPoses

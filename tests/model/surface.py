@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
-from torch_ekm.contact.contact_kinematics import FLAT, contact_frames
-from torch_ekm.contact.contact_set import ContactSet
+from torch_ekm.contact.contacts import FLAT, ContactSet, contact_frames
 from torch_ekm.typing import Float, Tensor
 
 

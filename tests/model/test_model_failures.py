@@ -21,7 +21,7 @@ from model_toys import (
 )
 
 from torch_ekm.contact import ForceStatus
-from torch_ekm.contact.contact_kinematics import constraint_matrix
+from torch_ekm.contact.contacts import constraint_matrix
 from torch_ekm.exceptions import NoContactError, PenetrationError, SingularGraspError, UnstableGraspError
 from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.poses import exp

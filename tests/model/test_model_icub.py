@@ -13,7 +13,7 @@ from model_icub import DEG, GRASPS, gripped
 from model_toys import F64, batch_of, changed, finite_difference_jacobian, relative_error, stacked
 
 from torch_ekm.contact import ForceOptions
-from torch_ekm.contact.contact_set import SHARED, VARYING
+from torch_ekm.contact.contacts import SHARED, VARYING
 from torch_ekm.kinematics import GraspState, HandKinematics
 from torch_ekm.model import KinematicModel
 

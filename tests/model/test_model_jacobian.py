@@ -21,7 +21,7 @@ from model_toys import (
     three_finger,
 )
 
-from torch_ekm.contact.contact_kinematics import contact_frames
+from torch_ekm.contact.contacts import contact_frames
 from torch_ekm.kinematics.poses import exp
 
 STEP = 2e-5  # [rad] of a motor

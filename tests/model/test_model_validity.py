@@ -12,7 +12,7 @@ from model_toys import F64, batch_of, changed, soft_two_finger, stacked, three_f
 
 pytest.importorskip("coal")
 
-from torch_ekm.contact.contact_set import NearMiss
+from torch_ekm.contact.contacts import NearMiss
 from torch_ekm.description import Shape, load_hand, load_object
 from torch_ekm.exceptions import NoContactError, NonFiniteError, ShapeError, SingularGraspError
 from torch_ekm.kinematics import GraspState, HandKinematics

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from .contact_kinematics import (
+from .contacts import (
     ContactKinematics,
+    ContactSet,
+    analyse,
     constraint_matrix,
     contact_kinematics,
     grasp_matrix,
     hand_jacobian,
 )
-from .contact_set import ContactSet
 from .detector import ContactDetector
-from .forces.problem import ForceOptions, ForceStatus
-from .forces.solve import contact_forces
-from .grasp_analysis import analyse
-from .signed_distance import signed_distance
+from .forces import ForceOptions, ForceStatus, contact_forces
+from .pad_contact import signed_distance
 
 __all__ = [
     "ContactDetector",

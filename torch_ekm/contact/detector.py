@@ -21,7 +21,7 @@ from ..exceptions import DescriptionError, ParameterError, ShapeError
 from ..kinematics import HandKinematics, LinkPoses
 from ..kinematics.poses import Kinematics
 from ..typing import Array, Float, Tensor
-from .contact_set import LINK_MARGIN, ContactSet, NearMiss
+from .contacts import LINK_MARGIN, ContactSet, NearMiss
 from .pad_contact import LinkShapes, PadContact, Solid, pad_contact, pad_shape
 
 CROWN_RADIUS = 0.5

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .._arrays import EqualityProgram, solve_by_active_set
 from .._extras import require
 from .._noise import DEGREE
-from ..contact.forces.solve import EqualityProgram, solve_by_active_set
 from ..description import HandDescription
 from ..enhanced import EnhancedModel
 from ..exceptions import NonFiniteError, ParameterError, ShapeError, SolverError

@@ -13,7 +13,7 @@ import torch
 
 from .._noise import NOISE
 from ..contact import ContactSet, constraint_matrix
-from ..contact.contact_set import CHARACTERISTIC_LENGTH
+from ..contact.contacts import CHARACTERISTIC_LENGTH
 from ..contact.detector import ContactDetector
 from ..control.guards import Guards, ReadingTests, stated
 from ..enhanced import EnhancedModel

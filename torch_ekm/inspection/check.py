@@ -12,8 +12,8 @@ import numpy as np
 import torch
 
 from ..contact import ContactSet
-from ..contact.contact_kinematics import contact_frames
-from ..contact.signed_distance import signed_distance
+from ..contact.contacts import contact_frames
+from ..contact.pad_contact import signed_distance
 from ..control import ClosedLoop, LookAndMoveController, PoseTarget
 from ..control.ends import out_of_reach
 from ..description import ContactPad, HandDescription, ObjectDescription, Shape, load_hand, load_object

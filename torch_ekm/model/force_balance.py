@@ -11,10 +11,15 @@ import torch
 from numpy.typing import NDArray
 
 from .._arrays import like, namespace, zeros
-from ..contact.contact_kinematics import ContactKinematics
-from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from ..contact.forces.problem import BalanceEquations, ForceSolution, ForceStatus, friction_cones, margins
-from ..contact.forces.solve import contact_forces
+from ..contact.contacts import CHARACTERISTIC_LENGTH, ContactKinematics, ContactSet
+from ..contact.forces import (
+    BalanceEquations,
+    ForceSolution,
+    ForceStatus,
+    contact_forces,
+    friction_cones,
+    margins,
+)
 from ..description.hand import HandDescription
 from ..typing import AnyArray, Array, Bool, Float, Tensor
 from .arms import SAME, Arms

@@ -20,8 +20,8 @@ import torch
 
 from .._checks import check_kind
 from .._extras import require
-from ..contact.contact_set import VARYING, ContactSet
-from ..contact.forces.problem import BalanceEquations, ForceOptions, ForceSolution, force_cost, force_problem
+from ..contact.contacts import VARYING, ContactSet
+from ..contact.forces import BalanceEquations, ForceOptions, ForceSolution, force_cost, force_problem
 from ..exceptions import NoContactError
 from ..kinematics.poses import A_STATE, GraspState
 from ..typing import Float, Tensor
@@ -96,7 +96,7 @@ def differentiable_forces(
         closed: the last columns of its bound matrix, of loops, likewise.
     """
     cost = force_cost(eq, options)
-    problem, scale = force_problem(eq, cost, np.zeros((0, len(solution.mu)))), cost.scale
+    problem, scale = force_problem(eq, cost), cost.scale
     n_h, n_a, n = len(solution.mu), len(solution.lam), len(scale)
     x = np.concatenate([solution.mu, solution.lam, solution.bound]) / scale
     P, A = cost.P, cost.balance

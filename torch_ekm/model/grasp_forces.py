@@ -14,9 +14,8 @@ import torch
 
 from .._arrays import eye, namespace, norm, zeros
 from .._noise import NOISE
-from ..contact.contact_kinematics import ContactKinematics
-from ..contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet
-from ..contact.forces.problem import ForceOptions, ForceStatus
+from ..contact.contacts import CHARACTERISTIC_LENGTH, ContactKinematics, ContactSet
+from ..contact.forces import ForceOptions, ForceStatus
 from ..exceptions import ShapeError
 from ..typing import AnyArray, Array, Float, Tensor
 

@@ -10,8 +10,7 @@ from torch import nn
 from .._arrays import in_numpy, is_plain, like, namespace, zeros
 from .._checks import check_kind
 from .._noise import NOISE
-from ..contact.contact_kinematics import ContactKinematics, constraint_matrix, contact_kinematics
-from ..contact.contact_set import ContactSet, Detector
+from ..contact.contacts import ContactKinematics, ContactSet, Detector, constraint_matrix, contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError

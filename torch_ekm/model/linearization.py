@@ -11,7 +11,7 @@ import torch
 
 from .._arrays import as_tensors, eye, in_numpy, in_torch, is_plain, like, norm, of_fields, zeros
 from .._checks import check_finite, check_last
-from ..contact.contact_set import ContactSet
+from ..contact.contacts import ContactSet
 from ..kinematics.poses import GraspState
 from ..typing import AnyArray, Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance

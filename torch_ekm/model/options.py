@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from ..contact.forces.problem import ForceOptions
+from ..contact.forces import ForceOptions
 from ..exceptions import ParameterError
 
 

@@ -8,8 +8,7 @@ import torch
 from torch import nn
 
 from .._arrays import eye, like, namespace, norm, null_space, zeros
-from ..contact.contact_kinematics import ContactKinematics, ContactModel
-from ..contact.contact_set import CHARACTERISTIC_LENGTH
+from ..contact.contacts import CHARACTERISTIC_LENGTH, ContactKinematics, ContactModel
 from ..description.hand import HandDescription
 from ..exceptions import SingularGraspError, UnstableGraspError
 from ..typing import AnyArray, Bool, Float, Tensor

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from .._arrays import eye, like, namespace, zeros
-from ..contact.contact_kinematics import ContactKinematics
+from ..contact.contacts import ContactKinematics
 from ..kinematics.poses import cross, hat
 from ..typing import AnyArray, Bool, Float, Tensor
 

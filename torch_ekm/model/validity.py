@@ -13,7 +13,7 @@ import torch
 
 from .._arrays import as_tensors, like, namespace, norm
 from .._checks import check_kind, check_last
-from ..contact.contact_set import LINK_MARGIN, ContactSet
+from ..contact.contacts import LINK_MARGIN, ContactSet
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
 from ..kinematics.poses import GraspState

@@ -7,7 +7,7 @@ import torch
 
 from .._noise import NOISE
 from .._warnings import warn
-from ..contact.contact_kinematics import contact_kinematics
+from ..contact.contacts import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
 from ..estimation.parameter_filter import update

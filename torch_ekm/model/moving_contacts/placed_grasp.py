@@ -8,13 +8,15 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from ..._arrays import in_numpy
-from ...contact.contact_kinematics import (
+from ...contact.contacts import (
+    CHARACTERISTIC_LENGTH,
     ContactKinematics,
     ContactModel,
+    ContactSet,
+    Detector,
     full_grasp_matrix,
     full_hand_jacobian,
 )
-from ...contact.contact_set import CHARACTERISTIC_LENGTH, ContactSet, Detector
 from ...description.hand import HandDescription
 from ...kinematics.poses import GraspState, Kinematics, LinkPoses, hat
 from ...typing import AnyArray, Array, Tensor

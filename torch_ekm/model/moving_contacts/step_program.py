@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ...contact.forces.problem import ForceStatus, friction_cones, margins
+from ...contact.forces import ForceStatus, friction_cones, margins
 from ...exceptions import NoContactError
 from ...typing import Array
 from ..force_balance import pack_forces

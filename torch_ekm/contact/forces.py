@@ -1,22 +1,25 @@
-"""The program of contact forces: its options, friction, balance, and rows."""
+"""Contact and actuator forces of a grasp: the relaxed minimal-force problem and its answer."""
 
 from __future__ import annotations
 
+import contextlib
+import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from enum import Enum
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..._checks import check_positive
-from ..._extras import require
-from ..._noise import NOISE
-from ...typing import Array
-from ..contact_kinematics import ContactModel
-from ..contact_set import CHARACTERISTIC_LENGTH
+from .._arrays import EqualityProgram, solve_by_active_set
+from .._checks import check_positive
+from .._extras import require
+from .._noise import NOISE
+from ..typing import Array
+from .contacts import CHARACTERISTIC_LENGTH, ContactModel
 
 Mask = NDArray[np.bool_]
 
@@ -264,29 +267,20 @@ def force_cost(eq: BalanceEquations, options: ForceOptions) -> ForceCost:
     return ForceCost(P, q, balance, eq.object_load * eq.row_scale, scale)
 
 
-def force_problem(eq: BalanceEquations, cost: ForceCost, cuts: Array, *, soft: bool = False):
+def force_problem(eq: BalanceEquations, cost: ForceCost):
     """Add the inequalities to the cost: a ``qpsolvers.Problem``.
 
     ```
     0 <= f_n <= f_max,  |u_i| <= mu_s f_n,i,  -lam >= 0 for tendons,  bounds of stops
     ```
 
-    The friction cones stand in it as polyhedra around them; ``cuts`` carve those down to the cones.
-
-    Args:
-        eq: the balance.
-        cost: of :func:`force_cost`.
-        cuts: more rows ``g mu <= 0``, ``(k, n_h)``.
-        soft: put the object balance into the cost, to measure how far it is from possible.
+    The friction cones stand in it as polyhedra around them, which cutting planes carve down to the cones.
     """
     qpsolvers = require("qpsolvers")
     P, q, balance, load, scale = cost
     n_h, n_a, n = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1], len(q)
-    if soft:
-        P = P * 1e-9 + balance.T @ balance
-        q = q * 1e-9 - balance.T @ load
     normals = [cone.start for cone in eq.cones]
-    rows = np.concatenate([*(cone.rows(outer_directions(cone.dim), n_h) for cone in eq.cones), cuts])
+    rows = np.concatenate([cone.rows(outer_directions(cone.dim), n_h) for cone in eq.cones])
     inequality = np.zeros((len(rows), n))
     inequality[:, :n_h] = rows * scale[:n_h]
     lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
@@ -294,5 +288,119 @@ def force_problem(eq: BalanceEquations, cost: ForceCost, cuts: Array, *, soft: b
     upper[n_h : n_h + n_a] = np.where(eq.tendon, 0.0, np.inf)
     L = CHARACTERISTIC_LENGTH
     lower[n_h + n_a :], upper[n_h + n_a :] = eq.bound_lower / L, eq.bound_upper / L
-    hard, rhs = (None, None) if soft else (balance, load)
-    return qpsolvers.Problem(P, q, inequality, np.zeros(len(rows)), hard, rhs, lower, upper)
+    return qpsolvers.Problem(P, q, inequality, np.zeros(len(rows)), balance, load, lower, upper)
+
+
+_TOLERANCE = 2e-7  # [N] largest friction violation left by the cutting planes
+_MAX_CUTS = 30
+
+
+def contact_forces(eq: BalanceEquations, options: ForceOptions | None = None) -> ForceSolution:
+    """Forces that balance the object exactly and the joints as well as possible.
+
+    The object balance is hard (mass and contact geometry are known best), the joint balance soft:
+    an equality there is infeasible for nearly every measured state. Friction is exact by cutting
+    planes.
+
+    Never raises for an impossible grasp: read ``status`` and ``violation``.
+    """
+    options = options or ForceOptions()
+    n_h = eq.object_matrix.shape[1]
+    cost = force_cost(eq, options)
+    covariance = None if eq.expected_covariance is None else cost.covariance(n_h)
+    program = None
+    with contextlib.suppress(np.linalg.LinAlgError):  # redundant rows, as of two point contacts
+        program = EqualityProgram(cost.P, cost.q, cost.balance, cost.load)
+        if _keeps_all(eq, cost.scale * program.x):  # it is then the optimum
+            return _unpack(eq, cost.scale * program.x, 0, covariance)
+    problem = force_problem(eq, cost)
+    bounds = [(-np.eye(len(cost.q)), -problem.lb), (np.eye(len(cost.q)), problem.ub)]
+    sides = [(rows[np.isfinite(most)], most[np.isfinite(most)]) for rows, most in bounds]
+    limits, most = (np.concatenate(part) for part in zip(*sides, strict=True))
+    active: list[int] = []
+    for solves in range(1, _MAX_CUTS + 1):
+        G, h = np.concatenate([limits, problem.G]), np.concatenate([most, problem.h])
+        optimum = None if program is None else solve_by_active_set(program, G, h, active)
+        if optimum is None:
+            solution = _solve(problem)
+            if not solution.found:
+                return _classify_failure(eq, cost, problem, solves)
+            x, active = solution.x, []
+        else:
+            x, active = optimum.x, optimum.active
+        unknowns = cost.scale * x
+        new = cutting_planes(eq.cones, unknowns[:n_h], _TOLERANCE)
+        if not len(new):
+            break
+        rows = np.zeros((len(new), len(cost.scale)))
+        rows[:, :n_h] = new * cost.scale[:n_h]
+        problem.G, problem.h = np.concatenate([problem.G, rows]), np.append(problem.h, np.zeros(len(new)))
+    return _unpack(eq, unknowns, solves, covariance)
+
+
+def _keeps_all(eq: BalanceEquations, unknowns: Array) -> bool:
+    """Whether the answer without inequalities keeps them, as it mostly does."""
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    mu, lam, bound = np.split(unknowns, [n_h, n_h + n_a])
+    normal = mu[[cone.start for cone in eq.cones]]
+    unbalanced = (eq.object_matrix @ mu - eq.object_load) * eq.row_scale
+    return bool(
+        all(cone.slack(mu) >= 0 for cone in eq.cones)
+        and (normal >= 0).all()
+        and (normal <= MAX_NORMAL).all()
+        and not (lam[eq.tendon] > 0).any()
+        and (bound >= eq.bound_lower).all()
+        and (bound <= eq.bound_upper).all()
+        and np.abs(unbalanced).max() < _TOLERANCE
+    )
+
+
+def _solve(problem):
+    """Solve a ``qpsolvers.Problem`` by PIQP with tight tolerances.
+
+    The weight of the forces is smaller than that of the joint residual by seven powers of ten: PIQP
+    needs iterative refinement for that (without it, one problem in eight with joints at their stops ran
+    into its limit of iterations). Should it give up nevertheless, Clarabel has the last word.
+    """
+    qpsolvers, csc = require("qpsolvers"), require("scipy.sparse").csc_matrix
+    options = {"eps_abs": 1e-10, "eps_rel": 1e-11, "iterative_refinement_always_enabled": True}
+    solution = qpsolvers.solve_problem(problem, "piqp", **options)
+    status = str(getattr(solution.extras.get("info"), "status", ""))
+    if solution.found or "PRIMAL_INFEASIBLE" in status:
+        return solution
+    require("clarabel")  # where it is missing, this names the extra
+    G, A = (None if M is None else csc(M) for M in (problem.G, problem.A))
+    sparse = qpsolvers.Problem(csc(problem.P), problem.q, G, problem.h, A, problem.b, problem.lb, problem.ub)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # qpsolvers warns when Clarabel finds the problem infeasible
+        return qpsolvers.solve_problem(sparse, "clarabel")
+
+
+def _unpack(
+    eq: BalanceEquations, unknowns: Array, solves: int, covariance: Array | None = None
+) -> ForceSolution:
+    """Split ``[mu; lam; tau]`` and certify it: joint residual and object violation from the equations."""
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    mu, lam, bound = np.split(unknowns, [n_h, n_h + n_a])
+    residual = eq.hand_load + eq.hand_matrix @ mu + eq.actuator_matrix @ lam
+    if len(bound):
+        residual = residual + eq.bound_matrix @ bound
+    violation = float(np.linalg.norm((eq.object_matrix @ mu - eq.object_load) * eq.row_scale))
+    return ForceSolution(ForceStatus.SOLVED, mu, lam, bound, residual, violation, solves, covariance)
+
+
+def _classify_failure(eq: BalanceEquations, cost: ForceCost, problem: Any, solves: int) -> ForceSolution:
+    """Find out whether the balance is impossible or the solver failed: by how little it can be missed."""
+    problem.P = problem.P * 1e-9 + cost.balance.T @ cost.balance
+    problem.q = problem.q * 1e-9 - cost.balance.T @ cost.load
+    problem.A = problem.b = None
+    solution = _solve(problem)
+    status, violation = ForceStatus.FAILED, math.nan
+    if solution.found:
+        violation = _unpack(eq, cost.scale * solution.x, solves).violation
+        if violation > 1e-6:  # else the balance is possible after all, and only the solver failed
+            status = ForceStatus.NOT_GRASPABLE
+    n_h, n_a = eq.object_matrix.shape[1], eq.actuator_matrix.shape[1]
+    nothing = np.full(n_h + n_a + len(eq.bound_lower) + len(eq.hand_load), np.nan)
+    mu, lam, bound, residual = np.split(nothing, np.cumsum([n_h, n_a, len(eq.bound_lower)]))
+    return ForceSolution(status, mu, lam, bound, residual, violation, solves + 1)

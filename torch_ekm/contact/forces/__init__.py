@@ -1,1 +1,0 @@
-"""Contact and actuator forces of a grasp: the relaxed minimal-force problem and its answer."""
