@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from torch_ekm.enhanced import AdaptiveModel, EnhancedModel
-from torch_ekm.estimation.force_sensitivity import ForceSensitivity
-from torch_ekm.estimation.parameter_filter import ParameterFilter, surprise, update
+from torch_ekm.estimation.filters import ForceSensitivity, ParameterFilter, surprise, update
 from torch_ekm.exceptions import (
     NoDerivativeError,
     NonFiniteError,

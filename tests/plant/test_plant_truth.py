@@ -9,7 +9,7 @@ import torch_ekm
 
 PACKAGE = Path(torch_ekm.__file__).parent
 MAY = {
-    "plant/observation.py": "defines it",
+    "plant/plant.py": "defines it",
     "plant/trajectory.py": "stores it",
     "simulation/": "makes it, and draws what simulated sensors see",
     "experiments/": "reports it",

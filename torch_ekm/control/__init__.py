@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.filters import ForceSensitivity
 from ..estimation.hand_figures import DescribedFigures, HandFigures
 from .closed_loop import ClosedLoop
 from .controller import LookAndMoveController

@@ -12,7 +12,7 @@ import torch
 from .._checks import check_finite, check_kind, check_shape
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.filters import ForceSensitivity
 from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import EKMError, GraspError, NoContactError, ParameterError, SolverError
 from ..kinematics import GraspState

@@ -13,7 +13,7 @@ from .._checks import check_kind
 from .._noise import DEGREE
 from ..exceptions import CommandRefusedError, GraspError, ParameterError
 from ..plant import Observation, PlantStatus
-from ..plant.observation import mean_reading
+from ..plant.plant import mean_reading
 from .controller import LookAndMoveController
 from .decision import Stop, StopReason
 from .focus import A_TARGET, PoseTarget

@@ -18,7 +18,7 @@ from .._noise import NOISE
 from .._recorded import Recorded, bound_problems, check_state, describe, make
 from ..contact import ContactDetector
 from ..description import HandDescription
-from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.filters import ForceSensitivity
 from ..estimation.hand_figures import DescribedFigures, HandFigures
 from ..exceptions import EKMError, FileFormatError, ParameterError, StateError
 from ..kinematics import ServoModel

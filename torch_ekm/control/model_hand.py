@@ -11,7 +11,7 @@ import torch
 
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..estimation.force_sensitivity import ForceSensitivity
+from ..estimation.filters import ForceSensitivity
 from ..exceptions import GraspEndsError, GraspError
 from ..kinematics import GraspState
 from ..model import ContactMotion, ContactStep, KinematicModel, Linearization

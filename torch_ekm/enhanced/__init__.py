@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from ..estimation.parameter_filter import ParameterFilter
+from ..estimation.filters import ParameterFilter
 from .adaptive_model import AdaptiveModel
-from .enhanced_model import EnhancedModel
+from .enhanced_model import EnhancedModel, load, save
 from .grasp import GraspEncoding, grasp_learner
-from .saving import load, save
 
 __all__ = [
     "AdaptiveModel",

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from .._checks import check_shape
-from ..estimation.parameter_filter import ParameterFilter
+from ..estimation.filters import ParameterFilter
 from ..exceptions import NoDerivativeError, ParameterError
 from ..residual.derivatives import recordable, value_and_jacobian
 from ..typing import Float, Tensor

@@ -22,7 +22,7 @@ from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
 from ..model.motion_equations import Motion, MotionEquations
 from ..model.reduction import Drives
 from ..typing import Array, Float, Tensor
-from .parameter_filter import ParameterFilter
+from .filters import ParameterFilter
 
 KINDS = ("springs", "moment_arms", "stiffness", "backlash")
 # of the prior, in units of those of the calibration: one lathe turns all pulleys, one cable strings them

@@ -18,7 +18,7 @@ from ..contact.detector import ContactDetector
 from ..control.guards import Guards, ReadingTests, stated
 from ..enhanced import EnhancedModel
 from ..enhanced.enhanced_model import kinematic_and_enhanced
-from ..estimation.parameter_filter import update
+from ..estimation.filters import update
 from ..exceptions import GraspError, NoContactError, ParameterError
 from ..kinematics import GraspState
 from ..model import KinematicModel, Linearization

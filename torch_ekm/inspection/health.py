@@ -11,7 +11,7 @@ import numpy as np
 from .._noise import NOISE
 from .._warnings import warn
 from ..description import HandDescription
-from ..estimation.parameter_filter import update
+from ..estimation.filters import update
 from ..exceptions import StateError
 from ..kinematics import ServoModel
 from ..plant import PlantStatus, Trajectory

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from .gate import Gate
-from .observation import Observation, PlantStatus, Stamps, Truth
-from .plant import FollowingPlant, FramesAtRest, Path, Plant, PlantWrapper, can_follow
-from .recorded import RecordingPlant, ReplayedPlant
-from .servo_inverse import ServoInverse
-from .trajectory import Movement, Trajectory
+from .gate import Gate, ServoInverse
+from .plant import (
+    FollowingPlant,
+    FramesAtRest,
+    Observation,
+    Path,
+    Plant,
+    PlantStatus,
+    PlantWrapper,
+    Stamps,
+    Truth,
+    can_follow,
+)
+from .trajectory import Movement, RecordingPlant, ReplayedPlant, Trajectory
 from .trial_log import TrialLog, verify_log
 
 __all__ = [

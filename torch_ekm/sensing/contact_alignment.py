@@ -10,7 +10,7 @@ from .._warnings import warn
 from ..contact.contacts import contact_kinematics
 from ..contact.detector import ContactDetector
 from ..description import HandDescription, ObjectDescription
-from ..estimation.parameter_filter import update
+from ..estimation.filters import update
 from ..kinematics import HandKinematics
 from ..plant import Observation, Plant, PlantWrapper
 from ..typing import Float, Tensor

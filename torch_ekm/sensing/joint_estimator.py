@@ -7,7 +7,7 @@ import torch
 from .._checks import check_finite, check_shape
 from .._noise import NOISE
 from ..description import HandDescription
-from ..estimation.parameter_filter import update
+from ..estimation.filters import update
 from ..exceptions import JointMismatchError
 from ..typing import Float, Tensor
 from .hall_calibration import HallCalibration, HallEstimate
