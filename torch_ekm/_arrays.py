@@ -106,6 +106,12 @@ def as_tensors(**values: object) -> list[Tensor]:
         raise ParameterError(", ".join(values), tuple(values.values()), valid) from None
 
 
+def as_states(x: AnyArray, dims: int) -> Array:
+    """A list of states in numpy: the batch of ``x`` flattened, ``dims`` axes of each state left."""
+    x = x.detach().double().cpu().numpy() if isinstance(x, Tensor) else x
+    return x.reshape(-1, *x.shape[x.ndim - dims :])
+
+
 def null_space(rows: Float[AnyArray, "m n"]) -> Float[Any, "n n_free"]:
     """Orthonormal basis N of ``rows N = 0`` (SVD); all of space where there are no rows.
 

@@ -14,8 +14,7 @@ from torch_ekm.contact.contacts import CHARACTERISTIC_LENGTH, ContactKinematics,
 from torch_ekm.contact.forces import ForceStatus, friction_cones, margins
 from torch_ekm.exceptions import EquilibriumError
 from torch_ekm.kinematics.poses import GraspState
-from torch_ekm.model.force_balance import ForceBalance, pack_forces
-from torch_ekm.model.grasp_forces import GraspForces
+from torch_ekm.model.grasp_forces import ForceBalance, GraspForces, pack_forces
 from torch_ekm.model.kinematic_model import KinematicModel
 from torch_ekm.model.stiffness import geometric_stiffness
 from torch_ekm.typing import Float, Tensor
@@ -91,7 +90,7 @@ class EquilibriumSolver:
         model = self.model
         _, kin = self._geometry(self.start)
         options = dataclasses.replace(model.options.forces, normal_std=0.05)
-        balance = _NoStops(model.hand, dataclasses.replace(model.options, forces=options), model.reduction)
+        balance = _NoStops(model.hand, model.reduction, options, model.options.slack_tension)
         at = self.start.q, kin, constraint_matrix(kin), model.potential(self.start)[0]
         forces = balance(*at, normal=normal_force)
         assert forces.solved

@@ -26,7 +26,7 @@ from torch_ekm.exceptions import NoContactError, PenetrationError, SingularGrasp
 from torch_ekm.kinematics import GraspState
 from torch_ekm.kinematics.poses import exp
 from torch_ekm.model import KinematicModel, ModelStatus
-from torch_ekm.model.manipulation import two_stage
+from torch_ekm.model.reduction import two_stage
 
 
 def test_no_contacts(toy):

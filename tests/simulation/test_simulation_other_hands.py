@@ -14,7 +14,7 @@ from other_hands import main
 
 from torch_ekm.description import load_hand, write_template
 from torch_ekm.model import KinematicModel, ModelOptions
-from torch_ekm.model.softening import softened
+from torch_ekm.model.kinematic_model import softened
 from torch_ekm.simulation import PlantConfig, SimulatedHand
 
 KINDS = {"tendon_springs": 0.05, "not_round": 0.05, "four_bar": 0.25, "idle": 0.05, "coupled": 0.15}

@@ -18,7 +18,7 @@ from ..estimation.hand_figures import HandFigures
 from ..exceptions import NoContactError, UnstableGraspError
 from ..kinematics import GraspState
 from ..model import Linearization
-from ..model.softening import softened
+from ..model.kinematic_model import softened
 from ..plant import Observation
 from ..typing import Array, Float, Tensor
 from .controller import LookAndMoveController

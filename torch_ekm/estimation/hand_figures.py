@@ -19,7 +19,7 @@ from ..exceptions import GraspError, StateError
 from ..kinematics.servo_model import Play, PlayState
 from ..model import Linearization
 from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
-from ..model.motion_equations import Motion, MotionEquations
+from ..model.linearization import Motion, MotionEquations
 from ..model.reduction import Drives
 from ..typing import Array, Float, Tensor
 from .filters import ParameterFilter

@@ -8,8 +8,7 @@ from .kinematic_model import KinematicModel
 from .linearization import Linearization
 from .moving_contacts.contact_motion import ContactMode, ContactMotion, ContactStep
 from .moving_contacts.placed_grasp import ContactLoads
-from .options import ModelOptions
-from .validity import ModelStatus
+from .validity import ModelOptions, ModelStatus
 
 __all__ = [
     "ContactLoads",

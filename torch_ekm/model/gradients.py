@@ -11,38 +11,22 @@ the bracket is 0, so the value is ``x*``, and its derivative is ``-(dr/dx)^-1 dr
 from __future__ import annotations
 
 import contextlib
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
 
-from .._checks import check_kind
 from .._extras import require
 from ..contact.contacts import VARYING, ContactSet
 from ..contact.forces import BalanceEquations, ForceOptions, ForceSolution, force_cost, force_problem
 from ..exceptions import NoContactError
-from ..kinematics.poses import A_STATE, GraspState
+from ..kinematics.poses import GraspState
 from ..typing import Float, Tensor
 
 _NEAR = 1e-3  # [N] constraints with less room may be active: an interior-point method stays off them a little
 _ACTIVE = 1e-9  # and are, if their multiplier is larger (the solver's tolerance is 1e-10)
 _STEP = 1e-6  # [rad, m] of the detector's central differences: its own rounding is about 1e-12
-
-
-def only_if_asked(method: Callable[..., Any]) -> Any:
-    """Record a graph only where a buffer of the model or the state requires a gradient."""
-
-    @functools.wraps(method)
-    def wrapped(self: Any, state: GraspState, *args: Any, **kwargs: Any) -> Any:
-        check_kind("state", state, GraspState, A_STATE)
-        figures = self.spring_stiffness, self.spring_rest, *self.reduction.drives, self.weight, self.com
-        given = *figures, state.q, state.position, state.rotation
-        with torch.set_grad_enabled(torch.is_grad_enabled() and any(x.requires_grad for x in given)):
-            return method(self, state, *args, **kwargs)
-
-    return wrapped
 
 
 def following(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import nn
@@ -16,20 +19,40 @@ from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.poses import A_STATE, GraspState, HandKinematics, Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
-from .arms import Arms, arms_at, bends, over_posture
-from .force_balance import ForceBalance
-from .gradients import following, only_if_asked
-from .grasp_forces import ExpectedForces, GraspForces
-from .linearization import FollowedFigures, Linearization
-from .motion_equations import MotionEquations
+from .gradients import following
+from .grasp_forces import ExpectedForces, ForceBalance, GraspForces
+from .linearization import FollowedFigures, Linearization, MotionEquations, sensitivities
 from .moving_contacts.contact_motion import ContactMotion, ContactStep
-from .options import ModelOptions
-from .reduction import Reduction, sensitivities
-from .stiffness import geometric_stiffness, gravity_gradient, gravity_hessian
-from .validity import at_pads, check_contacts, check_described, check_state, find_doubts
+from .reduction import Reduction
+from .stiffness import (
+    Arms,
+    arms_at,
+    bends,
+    geometric_stiffness,
+    gravity_gradient,
+    gravity_hessian,
+    over_posture,
+)
+from .validity import ModelOptions, at_pads, check_contacts, check_described, check_state, find_doubts
 
 TOUCHING = 0.2e-3
 """Gap of a link that counts as touching [m]."""
+_SOFTENS = 0.85  # of the stiffness without forces, below which a grasp is gripped no harder
+_FORCES = "mu", "force", "normal", "spin_moment"
+
+
+def only_if_asked(method: Callable[..., Any]) -> Any:
+    """Record a graph only where a buffer of the model or the state requires a gradient."""
+
+    @functools.wraps(method)
+    def wrapped(self: Any, state: GraspState, *args: Any, **kwargs: Any) -> Any:
+        check_kind("state", state, GraspState, A_STATE)
+        figures = self.spring_stiffness, self.spring_rest, *self.reduction.drives, self.weight, self.com
+        given = *figures, state.q, state.position, state.rotation
+        with torch.set_grad_enabled(torch.is_grad_enabled() and any(x.requires_grad for x in given)):
+            return method(self, state, *args, **kwargs)
+
+    return wrapped
 
 
 class KinematicModel(nn.Module):
@@ -98,8 +121,9 @@ class KinematicModel(nn.Module):
         self.detector = detector
         self._grown: tuple[float, ContactDetector] | None = None
         self.link_names = tuple(self.kinematics.link_names)
-        self.reduction = Reduction(hand, self.options, dtype)
-        self.balance = ForceBalance(hand, self.options, self.reduction)
+        self.reduction = Reduction(hand, self.options.actuator_compliance, dtype)
+        forces, slack_tension = self.options.forces, self.options.slack_tension
+        self.balance = ForceBalance(hand, self.reduction, forces, slack_tension)
         figures = {
             "spring_stiffness": hand.spring_stiffness, "spring_rest": hand.spring_rest, "com": obj.com,
             "weight": float(obj.mass) * torch.tensor(hand.gravity, dtype=torch.float64),
@@ -397,3 +421,10 @@ class KinematicModel(nn.Module):
             V_ss[..., :n_q, :n_q] += over_posture(q, over.stiffness_matrix)
         V_s = [torque, gravity_gradient(weight, com_lever)]
         return namespace(q).concat(V_s, -1), V_ss
+
+
+def softened(model: KinematicModel, lin: Linearization) -> bool:
+    """Whether contact forces have taken so much of a grasp's stiffness that it is near buckling."""
+    forces = dataclasses.replace(lin.forces, **{name: 0 * getattr(lin.forces, name) for name in _FORCES})
+    free = model.linearize(lin.state, lin.contacts, forces=forces, on_unstable="flag")
+    return float(lin.stability) < _SOFTENS * float(free.stability)

@@ -5,20 +5,117 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 
-from .._arrays import as_tensors, eye, in_numpy, in_torch, is_plain, like, norm, of_fields, zeros
+from .._arrays import as_tensors, eye, in_numpy, in_torch, is_plain, like, namespace, norm, of_fields, zeros
 from .._checks import check_finite, check_last
-from ..contact.contacts import ContactSet
+from ..contact.contacts import ContactKinematics, ContactModel, ContactSet
 from ..kinematics.poses import GraspState
 from ..typing import AnyArray, Bool, Float, Tensor
 from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
-from .motion_equations import Motion, MotionEquations
-from .options import ModelOptions
-from .reduction import Drives
-from .validity import Doubt, ModelStatus
+from .reduction import Drives, Reduction, two_stage
+from .stiffness import SAME, Arms
+from .validity import Doubt, ModelOptions, ModelStatus
+
+
+class FigureDerivative(NamedTuple):
+    """Derivative of some rows of ``ds = J_m w`` with respect to the figures of the hand, ``(n_r, ...)``."""
+
+    springs: Float[Tensor, "n_r n_q"]
+    """By the stiffness of each joint's spring [per N m/rad]."""
+    moment_arms: Float[Tensor, "n_r n_a n_q"]
+    """By each entry of J_a."""
+    stiffness: Float[Tensor, "n_r n_a"]
+    """By K_a of each actuator [per N m/rad]; 0 of rigid ones and of slack tendons."""
+
+
+@dataclass(frozen=True)
+class MotionEquations:
+    """``D ds + A^T dmu + J_a^T dlam = 0``, ``A ds = 0``, ``dlam = K_a (J_a ds - w)`` of one state.
+
+    Contact forces, held joints and slack tendons are those that were found with the described figures.
+    """
+
+    reduction: Reduction
+    stiffness: Float[Tensor, "n_s n_s"]
+    """D, with the described springs."""
+    constraints: Float[Tensor, "n_h n_s"]
+    """A."""
+    rows: tuple[int, ...]
+    """Which of the 6 n_c contact components are the rows of A."""
+    held: Bool[Tensor, " n_q"]
+    slack: Bool[Tensor, " n_a"]
+    moving: Bool[Tensor, " n_q"]
+    """Joints of the fingers that touch."""
+    arms: Arms = SAME
+    """Moment arms and loops at the posture."""
+
+    def solve(self, springs: Float[Tensor, " n_q"], drives: Drives) -> Motion:
+        """J_m with other figures.
+
+        Args:
+            springs: their change against the described ones [N m/rad].
+            drives: moment arms and stiffnesses of the actuators.
+
+        Raises:
+            SingularGraspError: a motion meets no stiffness.
+            UnstableGraspError: the grasp buckles with these figures.
+        """
+        n_q = len(springs)
+        D = self.stiffness.clone()
+        D.diagonal()[:n_q] += springs
+        return Motion(self, D, drives)
+
+
+class Motion:
+    """``ds = J_m w`` of one state and one set of figures, and its derivative by the figures."""
+
+    def __init__(self, of: MotionEquations, D: Tensor, drives: Drives) -> None:
+        reduction, self._n_h, self._arms = of.reduction, len(of.rows), of.arms
+        plain = is_plain(D, of.constraints, *drives)
+        given = (D, of.constraints, of.held, of.slack, *drives)
+        stiffness, A, held, slack, J_a, K_a = (x.numpy() if plain else x for x in given)
+        self._S, self._drives = like(reduction.scaled_basis, stiffness), Drives(J_a, K_a)
+        self._system = system = reduction.reduced(
+            stiffness, A, list(of.rows), held, slack, self._drives, of.arms
+        )
+        self._step = two_stage(system.D, system.E, system.R, system.F, actuators=reduction.actuators)
+        self.jacobian: Float[Tensor, "n_s n_a"] = torch.as_tensor(self._S @ self._step.motion)
+        """J_m."""
+
+    def derivative(self, moved: Float[Tensor, " n_a"], rows: list[int]) -> FigureDerivative:
+        """Of the rows of ``J_m w``, in closed form.
+
+        One adjoint solve for each row serves all figures::
+
+            [ D^T  E^T ] [ y  ]   [ e_c ]
+            [ E    0   ] [ nu ] = [ 0   ]        d ds_c = -(y, nu)^T (d of the equations at ds, dlam)
+
+        Args:
+            moved: w [rad].
+            rows: c, indices into ds.
+        """
+        system, S, n_h = self._system, self._S, self._n_h
+        motion, reaction = self._step.adjoint(system.D, S[rows].mT)
+        (J_a, K_a), arms_at = self._drives, self._arms
+        J_a = arms_at.of(J_a)
+        n_q = J_a.shape[1]
+        w = like(moved, S)
+        ds = (S @ (self._step.motion @ w))[:n_q]
+        dlam = system.actuator_force(self._step, n_h) @ w
+        y = (S[:n_q] @ motion).mT  # (n_r, n_q)
+        along = y @ J_a.mT
+        pull = 0 * along  # what a row answers to a change of each tendon's length
+        stiffness = 0 * along
+        soft, rigid = system.soft, system.rigid
+        pull[:, soft] = along[:, soft] * K_a[soft]
+        pull[:, rigid] = (reaction[n_h : n_h + len(rigid)] / system.arm).mT
+        stiffness[:, soft] = -along[:, soft] * (dlam[soft] / K_a[soft])
+        arms = -(dlam[:, None] * y[:, None, :] + pull[..., None] * ds)
+        arms = arms_at.of(arms)
+        return FigureDerivative(*map(torch.as_tensor, (-y * ds, arms, stiffness)))
 
 
 @dataclass(frozen=True)
@@ -188,6 +285,68 @@ class Linearization:
         check_last("delta_a", delta_a, self.manipulation_jacobian.shape[-1], "one entry per actuator")
         check_finite("delta_a", delta_a)
         return delta_a
+
+
+def sensitivities(
+    kin: ContactKinematics,
+    forces: GraspForces,
+    J: Float[AnyArray, "*batch n_s n_a"],
+    dmu: Float[AnyArray, "*batch n_h n_a"],
+) -> dict[str, Any]:
+    """Fields of a :class:`~torch_ekm.model.Linearization` that follow from J_m and dmu/da."""
+    df, dn = force_change(kin, dmu), normal_motion(kin, J)
+    normal = -(kin.contacts.normal[..., None, :] @ df + forces.force[..., None, :] @ dn)[..., 0, :]
+    found = {
+        "manipulation_jacobian": J,
+        "contact_force_sensitivity": dmu,
+        "normal_force_sensitivity": normal,
+        "margin_sensitivity": _of_margins(kin, forces, dmu, df, dn, normal),
+        "force_vector_sensitivity": df,
+        "normal_motion": dn,
+    }
+    tensors = {name: torch.as_tensor(part) for name, part in found.items()}
+    return {**tensors, "normal_rows": tuple(kin.normal_rows)}
+
+
+def normal_motion(
+    kin: ContactKinematics, J: Float[AnyArray, "*batch n_s n_a"]
+) -> Float[AnyArray, "*batch n_c 3 n_a"]:
+    """``d n_i/da = w_o x n_i + K_o sdot_i``, ``sdot_i = M_i (w_rel x n_i)``: turning of the normals."""
+    w_o = J[..., None, -3:, :]
+    w_rel = kin.relative_spin @ J[..., None, :, :]
+    return -(kin.normal_hat @ w_o) - (kin.contacts.object_curvature @ kin.roll) @ w_rel
+
+
+def force_change(
+    kin: ContactKinematics, dmu: Float[AnyArray, "*batch n_h n_a"]
+) -> Float[AnyArray, "*batch n_c 3 n_a"]:
+    """``C_i dmu_i``: change of the force vectors in hand axes."""
+    n_c, (*batch, _, n_a) = kin.contacts.n_c, dmu.shape
+    full = zeros(dmu, *batch, 6 * n_c, n_a)
+    full[..., kin.row_index, :] = dmu
+    return kin.frame @ full.reshape(*batch, n_c, 6, n_a)[..., :3, :]
+
+
+def _of_margins(
+    kin: ContactKinematics, forces: GraspForces, dmu: AnyArray, df: AnyArray, dn: AnyArray, normal: AnyArray
+) -> Float[AnyArray, "*batch n_c n_a"]:
+    """``d (mu_s f_n - |u|)/da``, ``u = [f_t; m_n mu_s/gamma]`` [N/rad]; ``d|u|`` counts as 0 at u = 0."""
+    mu_s, gamma = kin.contacts.friction, kin.contacts.torsional_friction
+    n_in = -kin.contacts.normal
+    f_t = forces.force - forces.normal[..., None] * n_in
+    df_t = df + forces.normal[..., None, None] * dn
+    square, product = (f_t * f_t).sum(-1), (f_t[..., None, :] @ df_t)[..., 0, :]
+    soft = [i for i, model in enumerate(kin.models) if model is ContactModel.SOFT_FINGER]
+    if soft:
+        at = [kin.normal_rows[i] + 3 for i in soft]
+        scale2 = (mu_s[soft] / gamma[soft].clip(1e-9)) ** 2
+        moment = forces.spin_moment[..., soft]
+        square[..., soft] += scale2 * moment**2
+        product[..., soft, :] += (scale2 * moment)[..., None] * dmu[..., at, :]
+    xp = namespace(square)
+    size = xp.sqrt(square)[..., None]
+    slope = xp.where(size > 1e-9, product / size.clip(1e-9), 0.0)
+    return mu_s[:, None] * normal - slope
 
 
 @runtime_checkable

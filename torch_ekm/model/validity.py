@@ -1,25 +1,60 @@
-"""Why a linearization may be wrong: findings with figure, limit and remedy, worst first."""
+"""What the kinematic model takes into account, what it may be given, and why what it says may be wrong."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
 import numpy as np
 import torch
 
-from .._arrays import as_tensors, like, namespace, norm
+from .._arrays import as_states, as_tensors, like, namespace, norm
 from .._checks import check_kind, check_last
 from ..contact.contacts import LINK_MARGIN, ContactSet
+from ..contact.forces import ForceOptions
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError, ParameterError, PenetrationError, ShapeError, UnknownNameError
 from ..kinematics.poses import GraspState
 from ..typing import AnyArray, Float, Tensor
-from .grasp_forces import GraspForces, as_states
-from .options import ModelOptions
+from .grasp_forces import GraspForces
+
+
+@dataclass(frozen=True)
+class ModelOptions:
+    """Options of :class:`~torch_ekm.model.KinematicModel`.
+
+    Raises:
+        ParameterError: a value outside its range.
+    """
+
+    rolling: bool = True
+    """Contact points run over the surfaces. False treats them as pinned."""
+    actuator_compliance: bool = True
+    """Use the actuators' series stiffness K_a where it is finite. False: all rigid."""
+    slack_tension: float | None = 0.0
+    """A tendon that pulls with at most this much [N, or N m for a in rad] is slack: it moves nothing. None:
+    all stay taut, as rods do, at any force."""
+    contact_margin: float = 0.002
+    """Gap up to which the detector takes a pad for touching [m]; more for noisy poses."""
+    max_overlap: float = 0.005
+    """Deepest penetration of finger and object that is still modelled [m]."""
+    on_unstable: str = "raise"
+    """"raise" UnstableGraspError, or "flag": return the formal Jacobian with status "unstable"."""
+    forces: ForceOptions = field(default_factory=ForceOptions)
+
+    def __post_init__(self) -> None:
+        if self.on_unstable not in ("raise", "flag"):
+            raise ParameterError("on_unstable", self.on_unstable, "'raise' or 'flag'")
+        if not self.max_overlap > 0:
+            raise ParameterError("max_overlap", self.max_overlap, "positive")
+        if not self.contact_margin >= 0:
+            raise ParameterError("contact_margin", self.contact_margin, "not negative")
+        if self.slack_tension is not None and not self.slack_tension >= 0:
+            raise ParameterError("slack_tension", self.slack_tension, "not negative, or None")
+
 
 _LOWEST = -0.9
 """Readings below this [N] are no noise about zero: three standard deviations of a fingertip sensor."""

@@ -18,7 +18,7 @@ from ..description import HandDescription, ObjectDescription, load_hand, load_ob
 from ..exceptions import EquilibriumError, GraspError, ParameterError, StateError, UnknownNameError
 from ..kinematics import GraspState
 from ..model import KinematicModel, ModelOptions
-from ..model.softening import softened
+from ..model.kinematic_model import softened
 from ..plant import Observation, PlantStatus, Stamps, Truth
 from ..plant import Path as Waypoints
 from ..typing import Array, Float, Tensor

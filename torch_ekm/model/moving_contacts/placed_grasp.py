@@ -20,10 +20,10 @@ from ...contact.contacts import (
 from ...description.hand import HandDescription
 from ...kinematics.poses import GraspState, Kinematics, LinkPoses, hat
 from ...typing import AnyArray, Array, Tensor
-from ..arms import arms_at, bends
-from ..linearization import FollowedFigures
-from ..options import ModelOptions
-from ..reduction import Reduction, normal_motion
+from ..linearization import FollowedFigures, normal_motion
+from ..reduction import Reduction
+from ..stiffness import arms_at, bends
+from ..validity import ModelOptions
 
 L = CHARACTERISTIC_LENGTH
 _LENGTHS = np.array([L, L, L, 1.0, 1.0, 1.0])[:, None]

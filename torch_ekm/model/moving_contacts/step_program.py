@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from ...contact.forces import ForceStatus, friction_cones, margins
 from ...exceptions import NoContactError
 from ...typing import Array
-from ..force_balance import pack_forces
-from ..linearization import Linearization
-from ..reduction import Drives, sensitivities
+from ..grasp_forces import pack_forces
+from ..linearization import Linearization, sensitivities
+from ..reduction import Drives
 from ..validity import find_doubts
 from .contact_laws import Response, StepProblem, StepSolution
 from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
