@@ -28,7 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from torch_ekm._versions import versions_of
+from torch_ekm._extras import versions_of
 
 HERE = Path(__file__).parent
 ROOT = HERE.resolve().parent

@@ -1,8 +1,11 @@
-"""Import optional dependencies, or name the extra that brings them."""
+"""Packages that may be missing: import them, or name the extra that brings them; their versions."""
 
 from __future__ import annotations
 
 import importlib
+import platform
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
 from types import ModuleType
 
 from .exceptions import MissingExtraError
@@ -40,3 +43,14 @@ def require(module: str, extra: str | None = None) -> ModuleType:
         if error.name is not None and error.name.split(".")[0] != root:
             raise  # the package is there and something inside it is broken: do not hide it
         raise MissingExtraError(root, extra) from None
+
+
+def versions_of(packages: Iterable[str]) -> dict[str, str]:
+    """Versions of Python and of the named distributions; "not installed" where there is none."""
+    found = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+from .._extras import versions_of
+from .._files import figure
 from .._terminal import console, say  # first: needs the extra
-from .._text import figure
-from .._versions import versions_of
 from ..exceptions import ParameterError
 
 import typer  # isort: skip

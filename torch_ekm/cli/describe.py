@@ -36,7 +36,7 @@ def hands(
     A file that is there is not overwritten.
     """
     from ..description import list_hands, load_hand, write_template
-    from ..description.template import ASSUMED
+    from ..description.transmission_file import ASSUMED
 
     if new is not None:
         written = write_template(new, base)

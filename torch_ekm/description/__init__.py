@@ -6,8 +6,7 @@ from .hand import Actuator, ContactPad, HandDescription
 from .objects import ObjectDescription
 from .registry import list_hands, list_objects, load_hand, load_object
 from .shape import Shape
-from .template import write_template
-from .transmission_file import write_transmission
+from .transmission_file import write_template, write_transmission
 
 __all__ = [
     "Actuator",

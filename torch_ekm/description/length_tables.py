@@ -11,10 +11,10 @@ import numpy as np
 from .._extras import require
 from ..exceptions import JointMismatchError
 from ..typing import Array
-from ._toml import TomlTable
+from ._reading import TomlTable
 from .lengths import ArmFunction, Lengths, Loops, Routed, TendonSprings, typical_arms
-from .mjcf_hand import MjcfHand
-from .mjcf_tendons import RoutedTendons, element_name
+from .mjcf import MjcfHand
+from .mjcf_transmission import RoutedTendons, element_name
 from .urdf import UrdfModel
 
 SPRING = ("name", "moment_arms", "mjcf_tendons", "stiffness", "slack")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..typing import Array
-from ._xml import listed
+from ._reading import listed
 
 _CLOSE = 1e-6  # of weights
 _RESTS = 1e-3  # [rad]: an angle written with few digits

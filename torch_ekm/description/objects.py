@@ -10,7 +10,7 @@ import numpy as np
 from .._extras import require
 from ..exceptions import DescriptionError
 from ..typing import Array
-from ._toml import TomlTable, read_toml
+from ._reading import TomlTable, read_toml
 from .shape import Shape
 from .urdf import UrdfModel, inertia_problem
 

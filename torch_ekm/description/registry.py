@@ -8,11 +8,9 @@ from pathlib import Path
 
 from .._files import read_file
 from ..exceptions import DescriptionError, UnknownNameError
-from ._toml import read_toml
-from ._xml import LARGEST
+from ._reading import LARGEST, read_toml
 from .hand import HandDescription
-from .mjcf import mjcf_files
-from .mjcf_hand import read_mjcf
+from .mjcf import mjcf_files, read_mjcf
 from .objects import ObjectDescription, read_object
 from .transmission import read_transmission
 from .urdf import read_urdf

@@ -15,12 +15,11 @@ import numpy as np
 
 from ..exceptions import DescriptionError, JointMismatchError
 from ..typing import Array
-from ._toml import TODO, TomlTable, read_toml
-from ._xml import listed
+from ._reading import TODO, TomlTable, listed, read_toml
 from .hand import Actuator, ContactPad, HallSensor, HandDescription
 from .length_tables import LOOP, SPRING, LengthReader
 from .mimic import overruled, unheld_joints
-from .mjcf_hand import MjcfHand
+from .mjcf import MjcfHand
 from .urdf import UrdfJoint, UrdfModel
 
 TABLES = (

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 
 from .._extras import require
-from .._text import figure
+from .._files import figure
 from ..exceptions import DescriptionError
 from ..typing import Array
-from ._toml import LARGEST_FIGURE
-from ._xml import listed, read_xml
+from ._reading import LARGEST_FIGURE, listed, read_xml
 from .mimic import Mimic, read_mimics
 from .shape import Shape, merge_capsules
 

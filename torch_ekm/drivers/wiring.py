@@ -9,7 +9,7 @@ from typing import Any
 
 from .._checks import check_positive
 from ..description import Actuator, HandDescription, load_hand
-from ..description._toml import TomlTable, read_toml, toml_text
+from ..description._reading import TomlTable, read_toml, toml_text
 from ..description.registry import HAND_FILES
 from ..exceptions import DescriptionError, ParameterError, UnknownNameError
 

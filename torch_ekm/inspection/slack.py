@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from .._files import write_whole
-from ..description._toml import toml_text
+from ..description._reading import toml_text
 from ..drivers import HandDriver, Wiring
 from ..exceptions import DescriptionError, DeviceError
 from ..plant import Gate

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from .._extras import versions_of
 from .._files import WriterLock, make_folder, told_as_damage, told_as_output_error
-from .._versions import versions_of
 from .._warnings import warn
 from ..description.registry import file_digests
 from ..exceptions import DescriptionError, EKMError, ParameterError, StateError

@@ -13,10 +13,9 @@ from typing import Any, cast
 import numpy as np
 
 from .._extras import require
-from .._files import check_file
-from .._text import figure
+from .._files import check_file, figure
 from ..description import Shape
-from ..description._xml import read_xml
+from ..description._reading import read_xml
 from ..description.shape import Kind, merge_capsules
 from ..description.urdf import UrdfModel
 from ..typing import Array

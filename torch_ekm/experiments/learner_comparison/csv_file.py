@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..._files import read_file
-from ..._text import decode, figure
+from ..._files import decode, figure, read_file
 from ...exceptions import DescriptionError
 from ...typing import Array
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ..._extras import require
+from ..._extras import require, versions_of
 from ..._files import make_folder, told_as_output_error
-from ..._versions import versions_of
 from .statistics import Estimate
 
 _PACKAGES = (
