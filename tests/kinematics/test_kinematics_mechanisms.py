@@ -12,7 +12,7 @@ from mechanisms import MECHANISMS
 from scipy.interpolate import CubicSpline
 
 from torch_ekm.description import HandDescription, load_hand, write_transmission
-from torch_ekm.description.lengths import ArmFunction, Lengths
+from torch_ekm.description.hand import ArmFunction, Lengths
 from torch_ekm.kinematics import ActuationMap
 
 mujoco = pytest.importorskip("mujoco")

@@ -10,9 +10,8 @@ import torch
 
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics.poses import exp, log
-from torch_ekm.sensing import MarkerBoard, PinholeCamera
-from torch_ekm.sensing.vision import board_pose
-from torch_ekm.sensing.vision.board_pose import estimate_board_pose, projection_jacobian
+from torch_ekm.sensing import MarkerBoard, PinholeCamera, tracker
+from torch_ekm.sensing.tracker import estimate_board_pose, projection_jacobian
 from torch_ekm.simulation import SimulatedCamera
 from torch_ekm.simulation.imaging import simulated_camera
 from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard
@@ -170,8 +169,8 @@ def test_nothing_comes_of_nonsense(pose_of, rng):
 
 def test_prior_decides_between_mirror_images(pose_of, rng, monkeypatch):
     """A small board far away: both solutions fit, the one near the prior is taken."""
-    monkeypatch.setattr(board_pose, "_MIN_CORNERS", 4)
-    monkeypatch.setattr(board_pose, "_CORNER_STD", 0.5)
+    monkeypatch.setattr(tracker, "_MIN_CORNERS", 4)
+    monkeypatch.setattr(tracker, "_CORNER_STD", 0.5)
     camera, board = PinholeCamera(), MarkerBoard(columns=1, rows=1, marker_size=0.012)
     pose, mirrored = pose_of(z=0.6, tilt_deg=25), pose_of(z=0.6, tilt_deg=-25)[:3, :3]
     image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, pose),)), rng)
@@ -179,12 +178,12 @@ def test_prior_decides_between_mirror_images(pose_of, rng, monkeypatch):
     assert estimate_board_pose(*seen).ambiguous
     for prior in (pose[:3, :3], mirrored):
         found = estimate_board_pose(*seen, prior)
-        assert board_pose.angle_between(found.rotation, prior) < np.radians(15)
+        assert tracker.angle_between(found.rotation, prior) < np.radians(15)
     near = pose_of(z=0.2, tilt_deg=25)
     image = SimulatedCamera(camera).render(CardScene((PlacedCard(board, near),)), rng)
     clear = estimate_board_pose(image, camera, board, corners(board, near, camera), mirrored)
     assert not clear.ambiguous
-    assert board_pose.angle_between(clear.rotation, near[:3, :3]) < np.radians(3)
+    assert tracker.angle_between(clear.rotation, near[:3, :3]) < np.radians(3)
 
 
 @pytest.mark.parametrize("camera", LENSES)

@@ -12,7 +12,7 @@ from .._extras import require
 from ..exceptions import JointMismatchError
 from ..typing import Array
 from ._reading import TomlTable
-from .lengths import ArmFunction, Lengths, Loops, Routed, TendonSprings, typical_arms
+from .hand import ArmFunction, Lengths, Loops, Routed, TendonSprings, typical_arms
 from .mjcf import MjcfHand
 from .mjcf_transmission import RoutedTendons, element_name
 from .urdf import UrdfModel

@@ -12,7 +12,7 @@ from .._extras import require
 from ..exceptions import DescriptionError
 from ..typing import Array
 from ._reading import TODO
-from .lengths import typical_arms
+from .hand import typical_arms
 from .urdf import UrdfModel
 
 

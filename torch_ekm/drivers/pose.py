@@ -12,7 +12,7 @@ from ..description import HandDescription
 from ..exceptions import ObjectLostError
 from ..plant import Observation, Plant, PlantStatus, PlantWrapper
 from ..sensing.joint_estimator import CHORDS, COUPLING_STD, ENCODER_STD
-from ..sensing.vision.tracker import MarkerTracker
+from ..sensing.tracker import MarkerTracker
 from ..typing import Float, Tensor
 
 _SENSOR_STD = 0.005  # s_h [rad]

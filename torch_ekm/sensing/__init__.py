@@ -7,12 +7,10 @@ readings."""
 
 from __future__ import annotations
 
+from .camera import MarkerBoard, PinholeCamera
 from .contact_alignment import ContactAligned
-from .hall_calibration import HallCalibration
-from .joint_estimator import JointEstimator
-from .vision.board import MarkerBoard
-from .vision.camera import PinholeCamera
-from .vision.tracker import MarkerTracker, Track, TrackStatus
+from .joint_estimator import HallCalibration, JointEstimator
+from .tracker import MarkerTracker, Track, TrackStatus
 
 __all__ = [
     "HallCalibration",

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from ..description import HandDescription, ObjectDescription
 from ..exceptions import ObjectLostError, StateError
 from ..plant import Observation, Plant, PlantStatus, PlantWrapper, Truth
-from ..sensing.hall_calibration import HallCalibration
-from ..sensing.joint_estimator import JointEstimator
-from ..sensing.vision.board import MarkerBoard
-from ..sensing.vision.tracker import MarkerTracker, Track
+from ..sensing.camera import MarkerBoard
+from ..sensing.joint_estimator import HallCalibration, JointEstimator
+from ..sensing.tracker import MarkerTracker, Track
 from ..typing import Array, Tensor
 from .hall_sensors import HallSensors
 from .imaging.card_scene import CardScene, camera_facing, grasp_scene

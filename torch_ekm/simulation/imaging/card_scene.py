@@ -10,8 +10,7 @@ from ..._extras import require
 from ...description import HandDescription, ObjectDescription, Shape
 from ...exceptions import ParameterError
 from ...kinematics import GraspState, HandKinematics
-from ...sensing.vision.board import MarkerBoard
-from ...sensing.vision.camera import PinholeCamera
+from ...sensing.camera import MarkerBoard, PinholeCamera
 from ...typing import Array
 
 _SIDES = 32  # of the prism that stands for a cylinder

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..._extras import require
 from ...exceptions import ParameterError
-from ...sensing.vision.camera import PinholeCamera
+from ...sensing.camera import PinholeCamera
 from .card_scene import CardScene, ConvexBody, PlacedCard
 
 _SAMPLES = 4  # of a card, per pixel and direction

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...description.hand import HandDescription
-from ...description.lengths import Lengths
+from ...description.hand import HandDescription, Lengths
 from ...typing import Array
 from ..parameters import PlantParameters
 

@@ -1,1 +1,0 @@
-"""Camera images: marker boards and their poses."""
