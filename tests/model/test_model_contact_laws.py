@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from torch_ekm.model.moving_contacts import contact_laws
-from torch_ekm.model.moving_contacts.contact_laws import StepProblem, StepSolution, solve
+from torch_ekm.model import contact_laws
+from torch_ekm.model.contact_laws import StepProblem, StepSolution, solve
 
 
 def answer(problem: StepProblem) -> StepSolution:

@@ -11,8 +11,7 @@ from turning_step import turning_step
 
 from torch_ekm.estimation.hand_figures import HandFigures
 from torch_ekm.exceptions import GraspError
-from torch_ekm.model import ContactMode, ContactMotion, KinematicModel
-from torch_ekm.model.moving_contacts import contact_laws, contact_motion
+from torch_ekm.model import ContactMode, ContactMotion, KinematicModel, contact_laws, contact_motion
 from torch_ekm.simulation import SimulatedHand
 
 DEG = torch.pi / 180

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from .calibration import calibrate
+from .contact_motion import ContactMode, ContactMotion, ContactStep
 from .grasp_forces import GraspForces
 from .kinematic_model import KinematicModel
 from .linearization import Linearization
-from .moving_contacts.contact_motion import ContactMode, ContactMotion, ContactStep
-from .moving_contacts.placed_grasp import ContactLoads
+from .step_program import ContactLoads
 from .validity import ModelOptions, ModelStatus
 
 __all__ = [

@@ -19,10 +19,10 @@ from ..description.hand import HandDescription
 from ..exceptions import NoContactError
 from ..kinematics.poses import A_STATE, GraspState, HandKinematics, Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
+from .contact_motion import ContactMotion, ContactStep
 from .gradients import following
 from .grasp_forces import ExpectedForces, ForceBalance, GraspForces
 from .linearization import FollowedFigures, Linearization, MotionEquations, sensitivities
-from .moving_contacts.contact_motion import ContactMotion, ContactStep
 from .reduction import Reduction
 from .stiffness import (
     Arms,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...typing import Array
+from ..typing import Array
 
 Mask = NDArray[np.bool_]
 

@@ -6,22 +6,28 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from ..._arrays import in_torch, of_fields
-from ...contact.detector import ContactDetector
-from ...exceptions import GraspEndsError, GraspError, NoContactError
-from ...kinematics.poses import GraspState, exp
-from ...typing import Array, Float, Tensor
+from .._arrays import in_torch, of_fields
+from ..contact.detector import ContactDetector
+from ..exceptions import GraspEndsError, GraspError, NoContactError
+from ..kinematics.poses import GraspState, exp
+from ..typing import Array, Float, Tensor
 from .contact_laws import Response, StepSolution, solve
-from .placed_grasp import ContactLoads, GraspModel, L, PlacedGrasp
-from .step_program import HandLaws, StepProgram, Way, mode_linearization
-
-if TYPE_CHECKING:
-    from ..linearization import Linearization
+from .linearization import Linearization
+from .step_program import (
+    ContactLoads,
+    GraspModel,
+    HandLaws,
+    L,
+    PlacedGrasp,
+    StepProgram,
+    Way,
+    mode_linearization,
+)
 
 NEAR = 0.004
 """Gap [m] up to which a pad or a link may close in a motion."""
