@@ -1,8 +1,8 @@
 """Drivers against the genuine other ends that are installed: python benchmarks/drivers.py.
 
 The same simulated hand is turned in process and behind each bus; then motors alone are sent spoilt messages,
-lose their cable, and their driver's process is killed. YARP's bindings may be installed in another Python
-than this one. Last line: turns that agree within 0.05 deg and have the same reason, wrong wirings refused,
+lose their cable, and their driver's process is killed. TORCH_EKM_YARP_PYTHON names another Python that has
+YARP's bindings. Last line: turns that agree within 0.05 deg and have the same reason, wrong wirings refused,
 kills after which the motors stood within 100 ms.
 """
 
@@ -283,9 +283,6 @@ def tell(text: str) -> None:
 
 def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    python = os.environ.get("TORCH_EKM_YARP_PYTHON", sys.executable)
-    about = "that has YARP's bindings; $TORCH_EKM_YARP_PYTHON"
-    options.add_argument("--yarp-python", default=python, metavar="PATH", help=about)
     options.add_argument("--quick", action="store_true", help="a fiftieth of it: to see that it works")
     options.add_argument("--out", type=Path, default=Path("drivers_output"), help="keeps what is finished")
     given = options.parse_args()
@@ -296,8 +293,6 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for bus in BUSES:
-            if bus.kind == "yarp":
-                bus = bus._replace(python=given.yarp_python)
             if not bus.installed:
                 parts.append(f"{bus.kind} not installed")
                 continue

@@ -200,10 +200,9 @@ def here(kind: str) -> Iterator[Held]:
 
 
 @contextmanager
-def behind(kind: str, python: str) -> Iterator[Held]:
+def behind(kind: str) -> Iterator[Held]:
     """A simulated hand behind an emulated bus."""
     bus = next(one for one in BUSES if one.kind == kind)
-    bus = bus._replace(python=python) if kind == "yarp" else bus
     with tempfile.TemporaryDirectory() as folder, opened(bus, Path(folder), "hand") as (end, path):
         model = KinematicModel(SimulatedHand(HAND, OBJECT).hand, load_object(OBJECT))
 
@@ -317,10 +316,10 @@ def whole(held: Held, seen: Observation) -> float:
         return time.monotonic() - began
 
 
-def kills(kind: str, n: int, seed: int = 0, python: str = sys.executable) -> Counter[str]:
+def kills(kind: str, n: int, seed: int = 0) -> Counter[str]:
     """What came of ``n`` turns of a hand that were killed at random moments."""
     draw, ends = np.random.default_rng(seed), Counter[str]()
-    with here(kind) if kind in HERE else behind(kind, python) as held:
+    with here(kind) if kind in HERE else behind(kind) as held:
         longest = held.apart(partial(whole, held, held.grip()))
         for k in range(n):
             moment = draw.uniform(0.0, 1.0)
@@ -339,16 +338,13 @@ def main() -> None:
     arguments.add_argument("--hands", default="light,sapien,mujoco,dynamixel", help=f"of {','.join(HANDS)}")
     arguments.add_argument("--kills", type=int, default=50, help="of each")
     arguments.add_argument("--seed", type=int, default=1000)
-    about = "that has YARP's bindings; $TORCH_EKM_YARP_PYTHON"
-    python = os.environ.get("TORCH_EKM_YARP_PYTHON", sys.executable)
-    arguments.add_argument("--yarp-python", default=python, metavar="PATH", help=about)
     given = arguments.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     parts = []
     for kind in given.hands.split(","):
-        ends = kills(kind, given.kills, given.seed, given.yarp_python)
+        ends = kills(kind, given.kills, given.seed)
         right = sum(ends[end] for end in RIGHT)
         print(f"{kind}: {', '.join(f'{n} {reason}' for reason, n in ends.most_common())}")
         parts.append(f"{kind} {right}/{given.kills}")

@@ -337,10 +337,10 @@ def _split(names: str, known: Mapping[str, Any]) -> list[str]:
     return [names] if names in known else names.split(";" if ";" in names else ",")
 
 
-def ask(asked: Question, arguments: Sequence[str] | None = None, about: str | None = __doc__) -> Report:
+def ask(asked: Question, arguments: Sequence[str] | None = None) -> Report:
     """Run a question as the command line says, and print its report; the last line is the verdict."""
     raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=about, formatter_class=raw)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
     parser.add_argument("--objects", help=f"names or paths; {','.join(asked.objects)} if left out")
     parser.add_argument("--seeds", type=parse_seeds, default=parse_seeds("1000:1010"), help="FIRST:END")
     parser.add_argument("--hands", help="see hands.py; also all, strong, losing, conditions")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 import threading
@@ -26,6 +27,7 @@ UNITS = {"dynamixel": 4096 / (2 * math.pi), "ros2": 1.0, "yarp": 180 / math.pi} 
 ZEROS = {"dynamixel": (900, 3100), "ros2": (0, 0), "yarp": (0, 0)}
 PORT_NAME = "/hand"  # of the part, in YARP
 SPEED = 30 * DEG  # of motors alone [rad/s]
+_YARP_PYTHON = os.environ.get("TORCH_EKM_YARP_PYTHON", sys.executable)  # that has YARP's bindings
 
 
 def simulated() -> SimulatedHand:
@@ -64,7 +66,7 @@ BUSES = (
         lambda x: float(round(x)),
     ),
     Bus("ros2", Ros2Plant, "rclpy", "a node of genuine rclpy"),
-    Bus("yarp", YarpPlant, "yarp", "genuine yarpserver and rpc port"),
+    Bus("yarp", YarpPlant, "yarp", "genuine yarpserver and rpc port", python=_YARP_PYTHON),
 )
 
 

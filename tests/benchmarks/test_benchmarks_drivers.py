@@ -14,8 +14,6 @@ pytest.importorskip("sapien")
 @pytest.fixture(params=BUSES, ids=lambda bus: bus.kind)
 def bus(request, monkeypatch) -> Bus:
     found = request.param
-    if found.kind == "yarp":
-        found = found._replace(python=os.environ.get("TORCH_EKM_YARP_PYTHON", found.python))
     if not found.installed:
         pytest.skip(f"{found.needs} is not installed")
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))

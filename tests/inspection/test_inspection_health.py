@@ -86,6 +86,36 @@ def test_a_tendon_that_breaks_is_named_at_once(seed: int) -> None:
     assert change.found.endswith("broken, slipped, or off its pulley")
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_one_glitch_of_one_joint_sensor_is_no_change(seed: int) -> None:
+    made = Made(seed)
+    made.move(30)
+    first = made.log
+    made.log = Trajectory(seed, [], [made.look()])  # a second trial: no motion leads from frame 30 to it
+    made.move(15)
+    trials = [(0, first), (1, made.log)]
+    frames = [*first.observations, *made.log.observations]
+    for k in (3, 11, 12, 13, 20, 29, 30, 31, 40):
+        for degrees in (8.0, -25.0, 60.0):
+            frames[k].q[seed] += degrees * DEG
+            assert hand_health(HAND, trials) == [], (k, degrees)
+            frames[k].q[seed] -= degrees * DEG
+
+
+def test_what_the_last_motion_alone_says_is_to_be_confirmed() -> None:
+    made = Made(0)
+    made.move(30)
+    made.move(gave=(0.0, -30.0))
+    (change,) = hand_health(HAND, [(0, made.log)])
+    assert change[:4] == ("right", "tendon", 0, 30)
+    assert change.found.endswith("in the last motion: another must confirm it")
+    made.gain[1] = 0.0
+    made.move(2)
+    (change,) = hand_health(HAND, [(0, made.log)])
+    assert change.motion == 30
+    assert "confirm" not in change.found
+
+
 def test_a_tendon_that_lets_go_unloaded_shows_by_what_it_passes_on() -> None:
     made = Made(0)
     made.move(40)

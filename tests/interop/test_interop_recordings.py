@@ -144,16 +144,18 @@ def test_a_dataset_has_a_frame_for_each_observation(log: TrialLog, tmp_path: Pat
         log_to_lerobot(log, folder)
 
 
-def test_a_dataset_on_a_full_disk_is_a_typed_error(log: TrialLog, tmp_path: Path) -> None:
+def test_a_dataset_on_a_full_disk_is_a_typed_error_and_leaves_nothing(log: TrialLog, tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="extra 'interop'")
     resource = pytest.importorskip("resource", reason="not on Windows")
     most = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, most[1]))
     try:
         with pytest.raises(OutputError, match="dataset cannot be written"):
-            log_to_lerobot(log, tmp_path / "dataset")
+            log_to_lerobot(log, tmp_path / "new" / "dataset")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, most)
+    assert not any((tmp_path / "new").iterdir())
+    assert any(log_to_lerobot(log, tmp_path / "new" / "dataset").iterdir())
 
 
 def test_a_dataset_is_of_one_hand(log: TrialLog, tmp_path: Path) -> None:

@@ -45,9 +45,11 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
     """``J_a dq = g da`` of each tendon, ``|v| - |w| = d - sign(v) b`` of each servo: learned, and watched.
 
     Any motions will do, with the joints measured. What does not fit is summed up (CUSUM: Page, Continuous
-    Inspection Schemes, 1954); the actuator with the largest sum has changed when that is too large. When the
-    object is lost all tendons give way: of this motion only what exceeds twice any other's counts. The first
-    12 motions of an actuator, and those after a change, are its baseline.
+    Inspection Schemes, 1954); the actuator with the largest sum has changed when that is too large. One
+    motion is not enough: the next takes it back where a sensor was once read wrongly. What the last motion of
+    the logs alone says is named as unconfirmed. When the object is lost all tendons give way: of this motion
+    only what exceeds twice any other's counts. The first 12 motions of an actuator, and those after a change,
+    are its baseline.
 
     A tendon whose joints were never measured is named in a warning.
 
@@ -70,13 +72,16 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
             excused = 2 * max(others, default=0.0) if lost and part == "tendon" else 0.0
             watches[name, part].see(at, x, y, stood, excused)
         (name, part), worst = max(watches.items(), key=lambda one: one[1].sum)
-        if worst.sum > _ALARM:
+        if worst.sum > _ALARM and len(worst.misfits) > 1:
             watches[name, part] = after = _Watch(part)
             for _, x, y in worst.misfits[part == "tendon" :]:  # the first motion is that of the break
                 after.learn(x, y)
             changes.append((name, worst, after))
             for watch in watches.values():  # what one gives way to shows at others
                 watch.sum, watch.misfits = 0.0, []
+    for (name, part), watch in watches.items():
+        if watch.sum > _ALARM:
+            changes.append((name, watch, _Watch(part)))
     if off and (unread := [name for name in names if name not in read]):
         warn(f"joints of {', '.join(unread)} were never read: nothing is known of what they pass on")
     return [HealthChange(name, old.part, *old.misfits[0][0], old.against(new)) for name, old, new in changes]
@@ -119,7 +124,8 @@ class _Watch:
         theta, std, noise = _PRIORS[part]
         self.part, self.theta, self.P = part, np.array(theta), np.diag(np.square(std)) / noise**2
         self.count, self.weight, self.squares = 0, _WORTH, _WORTH * noise**2
-        self.sum = 0.0
+        self.sum = self.usual = 0.0
+        """Now, and before the last misfit."""
         self.misfits: list[tuple[tuple[int, int], Array, float]] = []
         """Motions since the sum was 0."""
 
@@ -138,19 +144,48 @@ class _Watch:
         bound = self.part == "servo" and stood and (error < 0 or self.count < BASELINE)
         if not math.isfinite(error * error) or bound:
             return  # nothing was read; a motor that stands within its dead zone does not show how wide it is
-        spread = 1 + float(x @ self.P @ x)
-        z2 = max(0.0, abs(error) - excused) ** 2 / (self.squares / self.weight * spread)
+        z2 = self._z2(x, y, excused)
         if self.count >= BASELINE:
-            before = [] if z2 / 2 - _DRIFT > _ALARM else self.misfits  # this motion alone is enough
-            self.sum = max(0.0, self.sum + z2 / 2 - _DRIFT)
-            self.misfits = [*before, (at, x, y)] if self.sum else []
-        if not excused and (self.count < BASELINE or z2 < NOISE.outlier**2):
+            self._sum_up(at, x, y, z2)
+        # figures of a servo may be far from usual, what a tendon passes on may not
+        usual = z2 < NOISE.outlier**2 or (self.count < BASELINE and self.part == "servo")
+        if not excused and usual:
             self.learn(x, y)
+
+    def _z2(self, x: Array, y: float, excused: float = 0.0) -> float:
+        spread = 1 + float(x @ self.P @ x)
+        return max(0.0, abs(self.error(x, y)) - excused) ** 2 / (self.squares / self.weight * spread)
+
+    def _sum_up(self, at: tuple[int, int], x: Array, y: float, z2: float) -> None:
+        trial, motion = at
+        if self.misfits:
+            before, x_before, y_before = self.misfits[-1]
+            if before == (trial, motion - 1) and self._taken_back((x_before, y_before), (x, y)):
+                self.sum = min(self.sum, self.usual + _ALARM / 2)
+                return
+            if before[0] != trial and len(self.misfits) == 1:  # nobody saw whether it stayed
+                self.sum = min(self.sum, _ALARM / 2)
+        self.usual, added = self.sum, z2 / 2 - _DRIFT
+        if added > _ALARM and self.sum < _ALARM / 2:
+            self.sum, self.misfits = (added if motion else _ALARM / 2), [(at, x, y)]
+        else:
+            self.sum = max(0.0, self.sum + added)
+            self.misfits = [*self.misfits, (at, x, y)] if self.sum else []
+
+    def _taken_back(self, *motions: tuple[Array, float]) -> bool:
+        """Two outliers that one wrong reading in between explains, and no figures that any hand has."""
+        x, error = np.stack([one[0] for one in motions]), np.array([self.error(*one) for one in motions])
+        other = error @ np.linalg.solve(np.eye(2) + x @ _Watch(self.part).P @ x.T, error)
+        unexplained = min(*(self._z2(*one) for one in motions), other * self.weight / self.squares)
+        return self._z2(x.sum(0), sum(y for _, y in motions)) < NOISE.outlier**2 < unexplained
 
     def against(self, new: _Watch) -> str:
         """What changed, in words."""
         was, now = self.theta, new.theta
         std = np.sqrt(new.squares / new.weight * np.diag(new.P))
+        if len(self.misfits) == 1:
+            off = self.error(*self.misfits[0][1:]) / _DEG
+            return f"{off:.1f} deg off in the last motion: another must confirm it"
         if self.part == "servo":
             both = zip(("dead zone", "bias"), now / _DEG, std / _DEG, was / _DEG, strict=True)
             return "; ".join(f"{name} {x:.2f} +-{s:.2f} deg, was {y:.2f}" for name, x, s, y in both)

@@ -37,8 +37,6 @@ class BagTable(NamedTuple):
     """From the first row on, by the recording's clock [s] ``(n,)``; it goes back where a run begins."""
     values: Array
     """``(n, columns)``, in the messages' own units; NaN: not known at that time."""
-    age: Array
-    """How old each value is [s] ``(n, columns)``; NaN: there was none."""
     run: Numbers
     """Number of the run of each row ``(n,)``: another one begins where a clock was set back."""
     notes: tuple[str, ...] = ()
@@ -182,19 +180,16 @@ def _table(clock: str, heard: dict[str, _Topic]) -> BagTable:
     if starts:
         notes.append(f"{len(np.unique(runs))} runs: a clock was set back")
     notes += [said for _, said in when.values() if said]
-    names, values, ages = [], [], []
+    names, values = [], []
     for topic in order:
         for name, (at, given) in heard[topic].columns.items():
             taken, order = when[topic][0][at], (np.arange(len(rows)), row_of[at]) if topic == clock else None
             held = np.inf if heard[topic].latched else _HELD
-            value, age = _held(time, runs, taken, run[topic][at], np.array(given), order, held)
+            values.append(_held(time, runs, taken, run[topic][at], np.array(given), order, held))
             names.append(name)
-            values.append(value)
-            ages.append(age)
     _, number = np.unique(runs, return_inverse=True)
-    shape = (len(names), len(time))
-    values, ages = np.reshape(values, shape).T, np.reshape(ages, shape).T
-    return BagTable(tuple(names), time - time[0], values, ages, number, tuple(notes))
+    values = np.reshape(values, (len(names), len(time))).T
+    return BagTable(tuple(names), time - time[0], values, number, tuple(notes))
 
 
 def _held(
@@ -205,8 +200,8 @@ def _held(
     given: Array,
     places: tuple[Numbers, Numbers] | None,
     held: float,
-) -> tuple[Array, Array]:
-    """Of each row the newest value of its run, by times or by ``places`` of rows and values; and its age.
+) -> Array:
+    """Of each row the newest value of its run, by times or by ``places`` of rows and values.
 
     NaN: there is none, or it is older than ``held`` mean intervals.
     """
@@ -215,15 +210,14 @@ def _held(
     at, place, run, given = at[order], place[order], run[order], given[order]
     steps = np.diff(at)[np.diff(run) == 0]
     most = held * max(steps.mean(), 1e-9) if len(steps) > 1 else np.inf
-    value, age = np.full(len(time), np.nan), np.full(len(time), np.nan)
+    value = np.full(len(time), np.nan)
     for one in np.unique(run):
         mine, rows = run == one, np.flatnonzero(runs == one)
         last = np.searchsorted(place[mine], key[rows], side="right") - 1
         known = last >= 0
         rows, last = rows[known], last[known]
-        age[rows] = time[rows] - at[mine][last]
-        value[rows] = np.where(age[rows] <= most, given[mine][last], np.nan)
-    return value, age
+        value[rows] = np.where(time[rows] - at[mine][last] <= most, given[mine][last], np.nan)
+    return value
 
 
 def _latched(ext: Any) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def log_to_lerobot(log: TrialLog, folder: str | Path, task: str = "turn the obje
     Raises:
         MissingExtraError: pandas or pyarrow is not installed.
         ParameterError: the folder exists; there is no trial; trials have other sensors than the first one.
-        OutputError: the dataset cannot be written.
+        OutputError: the dataset cannot be written; nothing of it is left.
     """
     pd, _, folder = require("pandas", "interop"), require("pyarrow", "interop"), Path(folder)
     if folder.exists():
@@ -73,14 +74,17 @@ def log_to_lerobot(log: TrialLog, folder: str | Path, task: str = "turn the obje
         name: {"count": [len(value)], **{one: getattr(value, one)(0).tolist() for one in figures}}
         for name, value in columns.items()
     }
-    with told_as_output_error(folder):
+    make_folder(folder.parent)
+    with told_as_output_error(folder), TemporaryDirectory(".part", folder.name, folder.parent) as beside:
+        made = Path(beside) / folder.name
         for place, rows in (("data", table), ("meta/episodes", pd.DataFrame(whole))):
-            path = folder / place / _FILE.format(chunk_index=0, file_index=0)
+            path = made / place / _FILE.format(chunk_index=0, file_index=0)
             make_folder(path.parent)
             rows.to_parquet(path, index=False)
-        pd.DataFrame({"task_index": [0]}, index=[task]).to_parquet(folder / "meta/tasks.parquet")
+        pd.DataFrame({"task_index": [0]}, index=[task]).to_parquet(made / "meta/tasks.parquet")
         for name, content in (("info", info), ("stats", stats)):
-            (folder / f"meta/{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+            (made / f"meta/{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+        made.rename(folder)
     return folder
 
 
