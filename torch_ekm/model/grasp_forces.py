@@ -359,7 +359,10 @@ class ForceBalance:
         sure = prior.stacked(np.array([solution.covariance for _, solution in problems]))
         sure = sure.reshape(*batch, *sure.shape[-2:])
         sure = torch.from_numpy(sure).to(q) if isinstance(q, Tensor) else sure
-        return with_covariance(kin.contacts, forces, sure)
+        force, spin = like(forces.force, sure), like(forces.spin_moment, sure)
+        normal, _, gradient = friction_use(kin.contacts, force, spin, kin.contacts.normal)
+        std = margin_std(kin.contacts, normal, gradient, sure)
+        return dataclasses.replace(forces, covariance=torch.as_tensor(sure), margin_std=torch.as_tensor(std))
 
     def _reduced(self, A: AnyArray, V_s: AnyArray) -> tuple[Any, Any, Any, Any]:
         """``-(A_p Z_p)^T``, ``Z_p^T V_p``, ``(A_q Z)^T``, ``Z^T V_q``: both in permitted motions."""
@@ -416,12 +419,3 @@ def pack_forces(kin: ContactKinematics, mu: AnyArray, lam: AnyArray, **rest) -> 
     parts = {"mu": mu, "lam": lam, "force": force, "spin_moment": full[..., 3], "normal": full[..., 0]}
     status, parts = rest.pop("status"), parts | rest
     return GraspForces(**{name: torch.as_tensor(part) for name, part in parts.items()}, status=status)
-
-
-def with_covariance(contacts: ContactSet, forces: GraspForces, covariance: AnyArray) -> GraspForces:
-    """The forces with how sure they are; ``covariance`` of the stack."""
-    force, spin = like(forces.force, covariance), like(forces.spin_moment, covariance)
-    normal, _, gradient = friction_use(contacts, force, spin, contacts.normal)
-    std = margin_std(contacts, normal, gradient, covariance)
-    known = {"covariance": torch.as_tensor(covariance), "margin_std": torch.as_tensor(std)}
-    return dataclasses.replace(forces, **known)
