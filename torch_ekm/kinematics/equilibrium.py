@@ -34,16 +34,6 @@ class Rest(NamedTuple):
     """P = dq/da, ``(n_q, n_a)``."""
 
 
-class _Found(NamedTuple):
-    q: Array
-    f: Array
-    """Forces of the rows."""
-    K: Array
-    """Last matrix, of the posture and of those rows that have a force."""
-    active: NDArray[np.intp]
-    """Which these are."""
-
-
 class FreeHand:
     r"""``min_q V_s(q) + 1/2 sum_i k_i (a_i - l_i(q))^2`` subject to loops, couplings and joint stops.
 
@@ -128,8 +118,9 @@ class FreeHand:
                 first += n
         return found
 
-    def _solve(self, a: Array, q: Array, f: Array) -> _Found | None:
-        """From a posture and forces nearby; None: it does not converge."""
+    def _solve(self, a: Array, q: Array, f: Array) -> tuple[Array, Array, Array, NDArray[np.intp]] | None:
+        """Posture, forces of the rows, last matrix, and which rows are in it since they have a force; from a
+        posture and forces nearby. None: it does not converge."""
         hand, n_q, n_a = self._hand, len(q), len(a)
         low, high, compliance = self._low.copy(), self._high.copy(), self._compliance.copy()
         low[:n_a] = a
@@ -167,7 +158,7 @@ class FreeHand:
             f = f + part * (after - f)
             if size < _EXACT or before < size < _ROUNDING:
                 off = np.abs(K @ x - right).max()
-                return _Found(q, f, K, active) if off < _UNSOLVED * max(1.0, np.abs(right).max()) else None
+                return (q, f, K, active) if off < _UNSOLVED * max(1.0, np.abs(right).max()) else None
             before = size
         return None
 
