@@ -132,17 +132,6 @@ def test_text_of_a_file_is_no_command_to_the_terminal(
     assert not {"\x1b", "\x07", "\x9b", "\u202e", "\ud800"} & {*printed}
 
 
-def test_what_the_system_refuses_is_told_in_a_line(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "file").touch()
-    nowhere = str(tmp_path / "file" / "log")
-    monkeypatch.setattr("sys.argv", ["torch-ekm", "reproduce", "online", "--quick", "--out", nowhere])
-    with pytest.raises(SystemExit):
-        main()
-    assert "cannot be written" in capsys.readouterr().err
-
-
 def test_verify(tmp_path: Path) -> None:
     with TrialLog(tmp_path, {}) as log:
         log.write(0, Trajectory(), {"reason": HOSTILE})

@@ -129,8 +129,6 @@ def test_objects_of_a_user(tmp_path: Path) -> None:
             (tmp_path / (name + suffix)).write_bytes(source.read_bytes())
     own = [str(tmp_path / f"{name}.urdf") for name in ("mug", "pen")]
     assert any("_mug_E-KM_0" in name for name in plan("generalize", (0,), objects=own).jobs)
-    with pytest.raises(ParameterError, match="'online' does not take it"):
-        plan("online", (0,), objects=own)
     (tmp_path / "pen.object.toml").unlink()
     with pytest.raises(DescriptionError, match=r"pen\.object\.toml"):  # before anything runs
         plan("generalize", (0,), objects=own)
@@ -150,5 +148,3 @@ def test_angles_of_a_user() -> None:
     assert isinstance(planned.protocol, Generalize)
     assert planned.protocol.angles_of("box") == (4.0, 8.0)
     assert planned.jobs.keys() != plan("generalize", (0,)).jobs.keys()  # no old results are taken up
-    with pytest.raises(ParameterError, match="left out"):
-        plan("online", (0,), angles_deg=(4.0,))

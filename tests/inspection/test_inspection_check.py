@@ -20,7 +20,7 @@ from torch_ekm.exceptions import GraspError
 from torch_ekm.inspection import check as module
 from torch_ekm.inspection.check import check_hand
 from torch_ekm.plant import PlantStatus
-from torch_ekm.simulation import PlantConfig, SimulatedHand
+from torch_ekm.simulation import SimulatedHand
 from torch_ekm.simulation.grasp_planning import pinch
 
 pytest.importorskip("sapien")
@@ -37,12 +37,11 @@ def files(tmp_path: Path) -> tuple[Path, Path]:
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One first guess of the planner, one pinch with faults, one gentler pinch, no trials, small turns: most
+    """One first guess of the planner, one pinch with faults, no trials, small turns: most
     rows need no more."""
     monkeypatch.setattr(pinch, "_GUESSES", 1)
     monkeypatch.setattr(ClosedLoop, "reach", SMALL_TURNS)
     monkeypatch.setattr(module, "_DISTURBED", 1)
-    monkeypatch.setattr(module, "_GENTLER", (2.0,))
     monkeypatch.setattr(module, "smallest_changes", lambda *_: [])
 
 
@@ -215,7 +214,7 @@ def test_springs_too_soft_for_the_usual_force_are_told_what_holds(monkeypatch):
 
 def test_a_planned_pinch_that_is_lost_is_told_with_forces_and_distance(monkeypatch):
     monkeypatch.setattr(SimulatedHand, "status", PlantStatus.LOST)
-    (row,) = module._pinch(HAND, load_object("can"), None, PlantConfig())
+    (row,) = module._pinch(HAND, load_object("can"), None)
     assert row.state == "error"
     assert re.search(r"s after closing: forces \[N\] left \d.*, right \d.*, the object \d+ mm off", row.found)
 

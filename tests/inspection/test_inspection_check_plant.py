@@ -14,8 +14,8 @@ import torch
 
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.drivers import BusReading, HandDriver, Sighting, Wiring, WithPose
+from torch_ekm.inspection import Check
 from torch_ekm.inspection.check_plant import check_plant
-from torch_ekm.inspection.row import Check
 from torch_ekm.kinematics import ActuationMap
 from torch_ekm.plant import Observation, PlantStatus, PlantWrapper
 

@@ -89,7 +89,7 @@ def check(
     stick), one motor after the other. Each row has what was found and the remedy. Ends with 1 if there is
     an error, with 0 if not.
     """
-    from ..inspection.row import Check
+    from ..inspection import Check
 
     if plant is None and (dry_run or emulate):
         raise ParameterError("plant", plant, "given with --dry-run or --emulate: a wiring file")

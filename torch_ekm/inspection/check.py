@@ -30,13 +30,12 @@ from ..simulation.grasp_planning.trials import smallest_changes
 from ..simulation.mechanism.assembly import true_hand
 from ..simulation.parameters import PlantParameters
 from ..simulation.physics.links import x_axis_to
-from .row import Check, State
+from . import Check, State
 
 _SURFACE = 2e-4  # [m] between a pad and its link's collision shape, and of an object from its grasp_width
 _RANGES = (0.05, 5.0)  # of what the joints allow; beyond them a figure has another unit
 _LOW_MARGIN = 0.1  # of the friction cone
 _CONTRADICT = 1e4  # [N/rad]: 100 N for 0.6 deg; soft actuators have some hundreds
-_GENTLER = (3.0, 2.0, 1.0)  # [N] pinch forces that are tried where the usual one is too high
 _STABLE = 1e-6  # [N m/rad]; less is none
 _TAUT = 1e-6  # [N m]
 _LEAST_SLACK = 0.005  # of an actuator's range; less is a spring that just rests
@@ -74,17 +73,15 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         return [*rows, Check("object's files", "error", str(error), "see docs/reference/file_formats.md")]
     rows += [*_width(obj), *_rigid(description), *_reach(description, obj)]
     unfit = any(row.state == "error" for row in rows)
-    pinch = list(_pinch(description, obj, picture, PlantConfig()))
+    pinch = list(_pinch(description, obj, picture))
     if any(row.state == "error" for row in pinch):
         if not unfit and (other := [row.name for row in pads if row.state != "ok"]):
             remedy = f"first paste the shapes of {', '.join(other)} as printed above"
             found = "parts of the hand other than the pads touch the object"
             return [*rows, Check("collision shapes", "error", found, remedy), *pinch]
-        if unfit:  # no other figure cures a fault of the files
-            return [*rows, *pinch]
-        unplanned = any(row.name == _UNPLANNED for row in pinch)
-        more = _cured(description, obj, picture) if unplanned else _gentler(description, obj)
-        return [*rows, *pinch, *more]
+        # no other figure cures a fault of the files
+        unplanned = not unfit and any(row.name == _UNPLANNED for row in pinch)
+        return [*rows, *pinch, *(_cured(description, obj, picture) if unplanned else ())]
     return [*rows, *pinch, *_turn(description, obj), *_disturbed(description, obj)]
 
 
@@ -212,17 +209,6 @@ def _cured(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
             _draw(hand, None, picture, obj, failed)
 
 
-def _gentler(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
-    """A pinch that is planned and yet not held may be so with a smaller force."""
-    for force in _GENTLER:
-        if force < hand.pinch_force and all(
-            row.state != "error" for row in _pinch(hand, obj, None, PlantConfig(pinch_force=force))
-        ):
-            remedy = f"write pinch_force = {force:g} under [hand], or stiffer springs"
-            yield Check("pinch force", "warning", f"too high: the pinch is sound at {force:g} N", remedy)
-            return
-
-
 def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """How far the model turns the pinched object: a pinch that holds may be at the edge of its friction."""
     remedy = "stiffer springs, another 'pinch_force', more friction, wider limits"
@@ -268,12 +254,10 @@ def _disturbed(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]
         yield Check("pinch, preset nominal", "ok", found)
 
 
-def _pinch(
-    hand: HandDescription, obj: ObjectDescription, picture: Path | None, config: PlantConfig
-) -> Iterator[Check]:
+def _pinch(hand: HandDescription, obj: ObjectDescription, picture: Path | None) -> Iterator[Check]:
     lin = seen = None
     try:
-        plant = SimulatedHand(hand, obj, config)
+        plant = SimulatedHand(hand, obj)
         seen = plant.reset(0)  # as it is: the sensors have no noise
         assert seen.fingertip_force is not None  # of a simulated hand as described
         measured = zip(hand.pads, seen.fingertip_force.tolist(), strict=True)

@@ -17,7 +17,7 @@ from ..kinematics import ActuationMap, HandKinematics
 from ..model import KinematicModel
 from ..plant import Gate, Observation, Path, Plant, PlantStatus, can_follow
 from ..typing import Array
-from .row import Check
+from . import Check
 from .wirings import Mistake, Motion, Readings, WiringTest
 
 _DEG = math.pi / 180
@@ -331,9 +331,7 @@ class _Checked:
 
     def _constant(self, motions: tuple[Motion, ...]) -> Iterator[Check]:
         """Joint sensors that read the same, bit by bit, while motors moved: left out from here on."""
-        moves = np.zeros(self.hand.n_q)
-        for motion in motions:
-            moves = np.maximum(moves, np.abs(self.free @ motion.a))
+        moves = np.abs([self.free @ motion.a for motion in motions]).max(axis=0, initial=0.0)
         read = torch.stack([seen.q for seen in self.looks])
         dead = (read == read[0]).all(0).numpy() & self.sensed & (moves > _STANDS)
         for j in np.flatnonzero(dead):

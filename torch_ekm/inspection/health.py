@@ -79,9 +79,7 @@ def hand_health(hand: HandDescription, trials: Iterable[tuple[int, Trajectory]])
             changes.append((name, worst, after))
             for watch in watches.values():  # what one gives way to shows at others
                 watch.sum, watch.misfits = 0.0, []
-    for (name, part), watch in watches.items():
-        if watch.sum > _ALARM:
-            changes.append((name, watch, _Watch(part)))
+    changes += [(name, one, _Watch(part)) for (name, part), one in watches.items() if one.sum > _ALARM]
     if off and (unread := [name for name in names if name not in read]):
         warn(f"joints of {', '.join(unread)} were never read: nothing is known of what they pass on")
     return [HealthChange(name, old.part, *old.misfits[0][0], old.against(new)) for name, old, new in changes]
@@ -124,8 +122,7 @@ class _Watch:
         theta, std, noise = _PRIORS[part]
         self.part, self.theta, self.P = part, np.array(theta), np.diag(np.square(std)) / noise**2
         self.count, self.weight, self.squares = 0, _WORTH, _WORTH * noise**2
-        self.sum = self.usual = 0.0
-        """Now, and before the last misfit."""
+        self.sum = 0.0
         self.misfits: list[tuple[tuple[int, int], Array, float]] = []
         """Motions since the sum was 0."""
 
@@ -161,11 +158,11 @@ class _Watch:
         if self.misfits:
             before, x_before, y_before = self.misfits[-1]
             if before == (trial, motion - 1) and self._taken_back((x_before, y_before), (x, y)):
-                self.sum = min(self.sum, self.usual + _ALARM / 2)
+                self.sum = min(self.sum, _ALARM / 2)
                 return
             if before[0] != trial and len(self.misfits) == 1:  # nobody saw whether it stayed
                 self.sum = min(self.sum, _ALARM / 2)
-        self.usual, added = self.sum, z2 / 2 - _DRIFT
+        added = z2 / 2 - _DRIFT
         if added > _ALARM and self.sum < _ALARM / 2:
             self.sum, self.misfits = (added if motion else _ALARM / 2), [(at, x, y)]
         else:
