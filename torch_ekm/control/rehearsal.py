@@ -265,8 +265,9 @@ class Rehearsal:
     def _most(self) -> float:
         """The hardest grip [N]: a grasp that its forces have made soft would buckle with more."""
         lin = self._start
-        soft = lin is not None and softened(self.hand.kinematic, lin)
-        return float(lin.forces.normal.max()) if soft else math.inf
+        if lin is None or not softened(self.hand.kinematic, lin):
+            return math.inf
+        return float(lin.forces.normal.max())
 
     def _there(self, state: GraspState) -> bool:
         return self._target is not None and self._controller.focus.error(self._target, state) <= _THERE
