@@ -152,10 +152,8 @@ class _Checked:
             point = pose[:3, :3] @ torch.from_numpy(middle) + pose[:3, 3]
             away = min(away, float((point - seen.position.double()).norm()))
         if away > _FAR:
-            found = (
-                f"the object is {1e3 * away:.0f} mm away from the nearest pad: the pose is in another frame"
-            )
-            return [Check("pose", "error", f"{found}, or in mm", remedy)]
+            found = f"the object is {1e3 * away:.0f} mm away from the nearest pad"
+            return [Check("pose", "error", f"{found}: the pose is in another frame, or in mm", remedy)]
         if self.model is None:
             found = f"{1e3 * away:.0f} mm from the nearest pad; contacts are not checked: no object is given"
             return [Check("pose", "ok", found)]
@@ -203,16 +201,13 @@ class _Checked:
             if jacobian is not None:
                 predicted = jacobian[-6:] @ motion.a
                 along.append((predicted, pose))
-                if (
-                    not self.test.rows[i] and self._cosine(predicted, pose) <= -0.5
-                ):  # no joint sensor shows it
+                # no joint sensor shows it
+                if not self.test.rows[i] and self._cosine(predicted, pose) <= -0.5:
                     found = "the object moves against what the model predicts: sign reversed"
                     rows.append(self._wrong(i, found, "sign"))
             motions.append(replace(motion, gain=gain))
-            if (
-                row is not None
-                or max(np.abs(motion.a).max(), np.abs(motion.q[self.sensed]).max(initial=0)) > 2 * _WILD
-            ):
+            most = max(np.abs(motion.a).max(), np.abs(motion.q[self.sensed]).max(initial=0))
+            if row is not None or most > 2 * _WILD:
                 break
         if along and not any(row.state == "error" for row in rows):
             rows += self._frame(along)

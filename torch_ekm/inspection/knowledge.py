@@ -69,17 +69,14 @@ def estimates(knowledge: HandKnowledge) -> list[Estimated]:
     servo, forces, learned, error = knowledge.servo, knowledge.forces, knowledge.figures, knowledge.error
     found = []
     if isinstance(servo, ServoModel):
-        for figure, values, stds in zip(
-            ("dead zone [deg]", "bias [deg]"),
-            (servo.dead_zone, servo.bias),
-            servo.standard_errors,
-            strict=True,
-        ):
-            for name, value, std, stuck in zip(servo.names, values, stds, servo.stuck, strict=True):
-                note = "stuck" * bool(stuck)
-                found.append(
-                    Estimated("servo", name, figure, float(value) / _DEG, float(std) / _DEG, 0.0, note)
+        learned_of = ("dead zone [deg]", servo.dead_zone), ("bias [deg]", servo.bias)
+        for (figure, values), stds in zip(learned_of, servo.standard_errors, strict=True):
+            found += [
+                Estimated("servo", name, figure, value / _DEG, std / _DEG, 0.0, "stuck" * bool(stuck))
+                for name, value, std, stuck in zip(
+                    servo.names, values.tolist(), stds.tolist(), servo.stuck, strict=True
                 )
+            ]
     for i, (scale, std) in enumerate(zip(forces.scale.tolist(), forces.scale_std.tolist(), strict=True)):
         found.append(Estimated("forces", f"pad {i}", "of the model's answer", scale, std, 1.0, ""))
     if isinstance(learned, HandFigures):
