@@ -56,7 +56,7 @@ class ClosedLoop:
             learned of the servos if the controller's model is no enhanced one.
         safety: when it looks again and stops.
         planner: decides on movements; None: :class:`WholeTurn` of an enhanced model, else :class:`OneStep`.
-        learn: False leaves the learner as it is.
+        learn: False leaves learner, figures and forces as they are; servos are followed all the same.
         decline: a target that the motors do not reach, to first order, ends before anything moves.
 
     Raises:

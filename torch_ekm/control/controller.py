@@ -52,7 +52,8 @@ class LookAndMoveController:
         focus: what of the pose must be reached, or the axis about which the object is to be turned.
         tasks: what a step should do (:class:`Task`); None: :data:`DEFAULT_TASKS`.
         limits: what it must not do (:class:`Limit`); None: :data:`DEFAULT_LIMITS`.
-        limiting: how much of the error a single step asks for.
+        limiting: how much of the error a single step asks for; a plan has pieces of its own, see
+            :class:`~torch_ekm.control.WholeTurn`.
         bound: phi, how much of that is made; None: all of it.
 
     Raises:

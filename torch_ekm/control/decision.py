@@ -45,7 +45,7 @@ class StopReason(Enum):
     COMMAND_REFUSED = "command refused"
     """By the :class:`~torch_ekm.plant.Gate` or the driver, before anything moved: see ``Stop.cause``."""
     WRONG_WAY = "wrong way"
-    """This and what follows: see :class:`~torch_ekm.control.Guards`."""
+    """This, what follows, and a weak grasp come from :class:`~torch_ekm.control.Guards`."""
     STALE_SENSOR = "stale sensor"
     BLIND = "object not seen"
     ENCODER_JUMP = "encoder jump"

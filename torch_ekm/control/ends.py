@@ -76,7 +76,7 @@ class Safety:
     rule: StoppingRule = StoppingRule()
     """Reached, stalled, step limit, actuator limits, object lost."""
     guards: Guards = field(default_factory=Guards)
-    """Stale sensor, and all reasons that follow it in :class:`StopReason`."""
+    """Wrong way, all reasons that follow it in :class:`StopReason`, and a weak grasp."""
 
 
 class Ends:

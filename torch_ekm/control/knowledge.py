@@ -265,9 +265,9 @@ class Lessons:
         self._gaps, self._controller.kinematic.surface = [], 0.0
 
     def touch(self, seen: Observation, otherwise: Callable[[Observation], float]) -> None:
-        """Where the object's surface is, by the gaps of the pads that press: the median of each reading, for
-        one pad may be off alone, and the mean of readings; unless another explanation of the gaps leaves less
-        of them, ``otherwise`` [m]."""
+        """Learn how far the surface is from its description: the mean over readings of the median gap of the
+        pads that press (one pad may be off alone). A reading whose gaps one offset of all joints explains
+        better is left out: ``otherwise`` is what that leaves of them [m]."""
         model = self._controller.kinematic
         names = model.pressing(seen.fingertip_force)
         if not (self._figures.learns and names and isinstance(model.detector, ContactDetector)):

@@ -232,10 +232,10 @@ class NormalForceLimit:
     f*_i is what :class:`GripForceTask` wants of a finger, which follows from load and friction: no finger
     fades.
 
-    A finger that measures more than ``maximum`` is loosened; where no pad measures, the estimate counts. One
-    that only an estimate beside the pad's puts above it is pressed no harder: pads that read too little must
-    not make the hand squeeze, nor springs that are not as described make it let go. Where both limits
-    contradict each other, the upper one holds.
+    A finger that measures more than ``maximum`` is loosened; where no pad measures, the estimate counts. If
+    only the model's estimate exceeds it, the finger is pressed no harder, and not loosened: pads may read too
+    little, and springs may be others than described. Where both limits contradict each other, the upper one
+    holds.
 
     Raises:
         ParameterError: ``maximum`` is not above ``minimum``.

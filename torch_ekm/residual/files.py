@@ -110,7 +110,7 @@ def rebuild(
         StateMismatchError: the state is not one of it.
     """
     there = sum(one.nbytes for one in state.values() if isinstance(one, torch.Tensor))
-    with told_as_damage(path, "description", FileFormatError), _Sized(path, there):
+    with told_as_damage(path, "description, or one of another version", FileFormatError), _Sized(path, there):
         if _objects(described) > _MOST_OBJECTS:
             raise FileFormatError(path, f"more than {_MOST_OBJECTS} objects, or choices without number")
         made = make(described, known)
