@@ -1,6 +1,6 @@
 """``matrix.py whole_turn``: what a plan is worth without a learner, and what f that adapts and g add to it.
 
-    python benchmarks/whole_turn.py --objects box,can,bottle --seeds 0:2
+python benchmarks/whole_turn.py --objects box,can,bottle --seeds 0:2
 """
 
 from __future__ import annotations

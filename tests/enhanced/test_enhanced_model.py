@@ -101,6 +101,8 @@ def test_bad_samples_leave_the_learner_untouched(generator: torch.Generator) -> 
         ekm.update(state[0], action[0], good * torch.nan)
     with pytest.raises(NonFiniteError, match="action"):
         ekm.update(state[0], action[0] * torch.inf, good, good)
+    with pytest.raises(NonFiniteError, match="state"):
+        ekm.update(state[0] * torch.nan, action[0], good)
     with pytest.raises(ParameterError, match="action"):
         ekm.update(state[0], action[0].tolist(), good)
     with pytest.raises(ShapeError, match=r"action must have shape \(\*batch, 2\)"):
@@ -171,6 +173,13 @@ def in_numpy(state: torch.Tensor, action: torch.Tensor) -> np.ndarray:
 def half_detached(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
     value = model(state, action)
     return torch.cat([value[..., :2], value[..., 2:].detach()], dim=-1)
+
+
+def test_a_model_that_fails_by_itself_says_so_itself() -> None:
+    weights = torch.ones(N_S, 3, dtype=torch.float64)
+    ekm = EnhancedModel(lambda s, a: s @ weights, SparseOnlineGP(N_S + N_A, 3, capacity=20))
+    with pytest.raises(RuntimeError, match="size mismatch|shapes"):
+        ekm.linearize(torch.zeros(N_S + 1).double(), torch.zeros(N_A).double())
 
 
 @pytest.mark.parametrize(

@@ -172,8 +172,8 @@ class Watch:
         return Verdict(seen, teaches, halt, "; ".join(filter(None, notes)), expected)
 
     def _slid(self, reason: StopReason, before: Observation, expected: Expectation, seen: Observation) -> str:
-        """How far the object slid, where two looks agree on a jump; empty: the jump is a fault. A pose jump is a
-        slide where the pads' forces changed, a joint jump where the pads that press lie on the object."""
+        """How far the object slid, where two looks agree on a jump; empty: the jump is a fault. A jump of the
+        pose is a slide where the pads' forces changed, of a joint where pads that press lie on the object."""
         came = felt(self.hand, expected, before, seen) if reason is StopReason.POSE_JUMP else None
         changed = came is not None and came.wrong
         if not (changed or (reason is StopReason.JOINT_JUMP and self.motions.on_surface(seen))):

@@ -28,6 +28,8 @@ def differentiated(
     try:
         value, J = value_and_jacobian(lambda a: f(recordable(state), a), action)
     except (RuntimeError, TypeError) as error:  # numpy does not take tensors that carry a derivative
+        with torch.no_grad():
+            f(state, action)  # what fails without a derivative, too, says so itself
         raise NoDerivativeError(f"{type(error).__name__}: {error}") from error
     if J is None:
         raise NoDerivativeError("its result is detached from it")

@@ -224,7 +224,8 @@ class EnhancedModel(Recorded, nn.Module):
         check_shape("increment", increment, predicted.shape, "as the prediction has")
         if self.learner.on_invalid == "raise":  # else the learner leaves such a sample out, and counts it
             for name, value in (
-                ("action", action), ("increment", increment), ("f(state, action)", predicted)
+                ("action", action), ("state, as encoded,", x[..., : x.shape[-1] - action.shape[-1]]),
+                ("increment", increment), ("f(state, action)", predicted),
             ):  # fmt: skip
                 check_finite(name, value)
         residual = self._gather(increment - predicted) * self.output_scale

@@ -78,7 +78,8 @@ def check_hand(hand: str, object: str = "box", picture: Path | None = None) -> l
         if not unfit and (other := [row.name for row in pads if row.state != "ok"]):
             remedy = f"first paste the shapes of {', '.join(other)} as printed above"
             found = "parts of the hand other than the pads touch the object"
-            return [*rows, Check("collision shapes", "error", found, remedy), *pinch]
+            told = [row for row in pinch if row.state == "error" or row.name == "picture"]
+            return [*rows, Check("collision shapes", "error", found, remedy), *told]
         # no other figure cures a fault of the files
         unplanned = not unfit and any(row.name == _UNPLANNED for row in pinch)
         return [*rows, *pinch, *(_cured(description, obj, picture) if unplanned else ())]
@@ -99,6 +100,9 @@ def _pads(hand: HandDescription) -> Iterator[Check]:
         elif not shapes:
             yield Check(name, "error", f"{found}; its link has no primitive shape", remedy)
         elif any(shape.kind == "box" and (signed_distance((shape,), ends)[0] < 0).all() for shape in shapes):
+            balls = tuple(shape for shape in shapes if shape.kind != "box")
+            if balls and np.abs(signed_distance(balls, ends)[0] + pad.radius).max() <= _SURFACE:
+                remedy = "shorten that box, or take it out: the pad's own shape is there"
             yield Check(name, "warning", f"{found}; in a box, whose edges touch first", remedy)
         elif np.abs(depth - pad.radius).max() > _SURFACE:
             yield Check(name, "warning", f"{found}; not the shape of its link", remedy)
@@ -181,7 +185,9 @@ def _rigid(hand: HandDescription) -> Iterator[Check]:
     pairs = zip(hand.actuators, true_hand(hand, PlantParameters()).actuators, strict=True)
     capped = [f"{was.name} {now.stiffness:g}" for was, now in pairs if was.stiffness != now.stiffness]
     found = f"rigid, in simulation [N m/rad]: {', '.join(capped)}" if capped else "of finite stiffness"
-    yield Check("actuators", "ok", found)
+    tendons = [one.name for one in hand.actuators if one.tendon and math.isinf(one.stiffness)]
+    remedy = f"the 'stiffness' of cable and servo [N m/rad] of {', '.join(tendons)}" if tendons else ""
+    yield Check("actuators", "warning" if tendons else "ok", found, remedy)
 
 
 def _reach(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
@@ -211,7 +217,7 @@ def _cured(hand: HandDescription, obj: ObjectDescription, picture: Path | None) 
 
 def _turn(hand: HandDescription, obj: ObjectDescription) -> Iterator[Check]:
     """How far the model turns the pinched object: a pinch that holds may be at the edge of its friction."""
-    remedy = "stiffer springs, another 'pinch_force', more friction, wider limits"
+    remedy = "stiffer springs, another 'pinch_force', more friction, wider limits; a loop may turn it farther"
     try:
         plant = SimulatedHand(hand, obj)
         seen = plant.reset(0)

@@ -14,6 +14,9 @@ from ..exceptions import BusError
 
 BAUDS = (57600, 1000000, 4000000, 3000000, 2000000, 115200, 9600)
 _TURN = 4096
+_BY_HAND = (
+    "without a bus: write the file as docs/how_to/drive_a_t42.md has it, and try it by 'check --plant --emulate'"
+)
 _HEAD = """\
 # Written from a scan: check it with torch-ekm check --plant.
 [hand]
@@ -56,7 +59,10 @@ def new_wiring(port: str, hand: str, bauds: tuple[int, ...] = BAUDS) -> str:
     """
     description = load_hand(hand).counted()
     for baud in bauds:
-        bus = DynamixelPort(port, baud)
+        try:
+            bus = DynamixelPort(port, baud)
+        except BusError as error:
+            raise BusError(port, f"{error.problem}; {_BY_HAND}") from error
         try:
             if ids := bus.scan():
                 found = registers(bus, ids)
