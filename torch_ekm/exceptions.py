@@ -92,7 +92,8 @@ class UnknownNameError(EKMError, KeyError):
 
     def __init__(self, kind: str, name: str, valid: Iterable[str]) -> None:
         self.kind, self.name, self.valid = kind, name, tuple(valid)
-        super().__init__(f"unknown {kind} '{name}'; valid are: {', '.join(self.valid) or '(none)'}")
+        listed = ", ".join(f'"{one}"' if "," in one else one for one in self.valid)
+        super().__init__(f"unknown {kind} '{name}'; valid are: {listed or '(none)'}")
 
     def __str__(self) -> str:  # KeyError prints the repr of its argument
         return str(self.args[0])

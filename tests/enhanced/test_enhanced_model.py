@@ -178,7 +178,7 @@ def half_detached(state: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
 def test_a_model_that_fails_by_itself_says_so_itself() -> None:
     weights = torch.ones(N_S, 3, dtype=torch.float64)
     ekm = EnhancedModel(lambda s, a: s @ weights, SparseOnlineGP(N_S + N_A, 3, capacity=20))
-    with pytest.raises(RuntimeError, match="size mismatch|shapes"):
+    with pytest.raises(RuntimeError, match=r"size mismatch|shapes"):
         ekm.linearize(torch.zeros(N_S + 1).double(), torch.zeros(N_A).double())
 
 

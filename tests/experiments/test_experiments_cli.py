@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from torch_ekm._terminal import as_printed, print_report, print_table, progress, unbroken
 from torch_ekm.cli import app, main
-from torch_ekm.cli._app import GROUPS
+from torch_ekm.cli._app import GROUPS, names
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
 from torch_ekm.experiments.reproduce import PROTOCOLS, plan
 from torch_ekm.plant import Trajectory, TrialLog
@@ -181,6 +181,17 @@ def test_columns_that_look_like_measured_and_predicted_are_proposed(tmp_path: Pa
     table.write_text("angle,torque,model_torque\n" + "0.1,1.0,0.9\n" * 50)
     done = CliRunner().invoke(app, ["compare", "--data", str(table), "--jobs", "1"])
     assert "--measured torque --predicted model_torque" in str(done.exception)
+
     table.write_text("angle,torque\n" + "0.1,1.0\n" * 50)
     done = CliRunner().invoke(app, ["compare", "--data", str(table), "--jobs", "1"])
     assert "--measured torque" not in str(done.exception)
+
+
+def test_names_of_columns_may_have_blanks_units_and_commas(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text('u,tau meas [Nm],tau sim [Nm],"q, deg"\n' + "1,2,2.1,3\n" * 50)
+    done = CliRunner().invoke(app, ["compare", "--data", str(path), "--jobs", "1"])
+    assert "--measured 'tau meas [Nm]' --predicted 'tau sim [Nm]'" in str(done.exception)
+    assert names('u, "q, deg", u') == ("u", "q, deg")
+    done = CliRunner().invoke(app, ["compare", "--data", str(path), "--jobs", "1", "--measured", "q"])
+    assert '"q, deg"' in str(done.exception)

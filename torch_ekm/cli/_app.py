@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -106,5 +107,6 @@ def parse_angles(text: str) -> tuple[float, ...]:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Names separated by commas, each once: ``"a, b, a"`` as ("a", "b")."""
-    return tuple(dict.fromkeys(filter(None, map(str.strip, text.split(",")))))
+    """Names separated by commas, each once: ``a, b, a, "c, d"`` as ("a", "b", "c, d")."""
+    words = next(csv.reader([text], skipinitialspace=True), [])
+    return tuple(dict.fromkeys(filter(None, map(str.strip, words))))

@@ -94,7 +94,8 @@ def compare(
         str,
         Option(
             help="Names, separated by commas: default, SOGP, linear RLS, model alone, ...; an "
-            "unknown name lists all. If left out: all but those of other libraries."
+            "unknown name lists all. If left out: all but those of other libraries. Your own: "
+            "docs/how_to/write_a_learner.md."
         ),
     ] = "",
     targets: Annotated[str, Option("--targets", "--measured", help="To predict; else y, y1, ...")] = "",
@@ -128,7 +129,7 @@ def compare(
     """
     from ..experiments import compare as run
     from ..experiments.learner_comparison.recordings import load_recording
-    from ..experiments.learners import COMPARED
+    from ..experiments.learners import COMPARED, learner_factory
 
     chosen = names(learners) if learners else COMPARED
     if not chosen:
@@ -136,6 +137,8 @@ def compare(
     if jobs > 1 and find_spec("joblib") is None:
         say("One process at a time: joblib, of the extra 'experiments', is not installed.")
         jobs = 1
+    for name in chosen:
+        learner_factory(name)  # an unknown one is refused before anything is read
     columns = {"targets": names(targets), "inputs": names(inputs), "predicted": names(predicted)}
     columns |= {"run": run_column, "clock": clock}
     with console.status("reading"):  # simulated_hand is made, which takes a minute

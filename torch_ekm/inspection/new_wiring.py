@@ -14,9 +14,7 @@ from ..exceptions import BusError
 
 BAUDS = (57600, 1000000, 4000000, 3000000, 2000000, 115200, 9600)
 _TURN = 4096
-_BY_HAND = (
-    "without a bus: write the file as docs/how_to/drive_a_t42.md has it, and try it by 'check --plant --emulate'"
-)
+_BY_HAND = "without a bus: write it as docs/how_to/drive_a_t42.md does, and try 'check --plant --emulate'"
 _HEAD = """\
 # Written from a scan: check it with torch-ekm check --plant.
 [hand]

@@ -119,6 +119,7 @@ class Comparison:
         if medians:
             share = 100 * rare_share(self.errors[stream.name, best])
             text += f" Medians: one row in a hundred makes {share:.0f} % of the squared error."
+            text += " Is it a gap, written as -999?" if share > 99 else ""
         if gives_away(stream):
             text += " The inputs give y: is what was measured among them?"
         text += stream.notes

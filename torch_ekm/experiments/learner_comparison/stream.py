@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,10 +21,12 @@ _REST = 0.01  # of the deviation in all: less is rest
 LEAST = 40  #: samples; fewer do not distinguish learners
 
 #: How names of columns say that they hold what a model predicts, and what was measured.
+_UNIT = r"(?=$| *[\[(])"
 _PREDICTS = re.compile(
-    r"^(model|pred|predicted|nominal|sim)_|_(model|pred|predicted|nominal|sim|hat)$", re.IGNORECASE
+    rf"^(model|pred|predicted|nominal|sim)[_ ]|[_ ](model|pred|predicted|nominal|sim|hat){_UNIT}",
+    re.IGNORECASE,
 )
-_MEASURED = re.compile(r"^(meas|measured|real|true)_|_(meas|measured|real|true)$", re.IGNORECASE)
+_MEASURED = re.compile(rf"^(meas|measured|real|true)[_ ]|[_ ](meas|measured|real|true){_UNIT}", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -203,7 +206,7 @@ def _proposed(names: Sequence[str]) -> str:
     ]
     if not pairs:
         return ""
-    measured, predicted = (",".join(side) for side in zip(*pairs, strict=True))
+    measured, predicted = (shlex.quote(",".join(side)) for side in zip(*pairs, strict=True))
     return f"; these look like pairs: --measured {measured} --predicted {predicted}"
 
 
