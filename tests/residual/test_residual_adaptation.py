@@ -25,7 +25,7 @@ from torch_ekm.residual import (
 )
 from torch_ekm.residual.kernels.kernel import Kernel
 from torch_ekm.residual.recent import Recent
-from torch_ekm.residual.sparse_gp.prequential_loss import Queries
+from torch_ekm.residual.sparse_gp.hyperparameters import Queries
 
 
 def system(seed: int, n: int, noise: float = 0.1) -> tuple[torch.Tensor, torch.Tensor]:

@@ -20,7 +20,6 @@ from .mixture_engine import CompiledMixture
 from .printed import mixture
 from .report import Expected, MomentsWithJacobians, UpdateReport
 from .returns import Returns
-from .sparse_gp.monitor import COOL, DetectChanges
 from .sparse_gp.part import Host
 from .tails import MEMORY, ScaleMixture, ScaleMixtureLaw
 
@@ -179,8 +178,7 @@ class MixtureResidual(ResidualLearner):
         nis, *said = self._judged(x, y, mask, moments, sooner)
         reports = [learner.step(x, y, mask) for learner in self.members]
         if self.returns is not None and (mask is None or bool(mask)):
-            figures = y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis), self.has_changed()
-            self.note_return(x, *figures)
+            self.note_return(x, y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis))
         part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
             (part * torch.stack(each, dim=-1).to(part)).sum(-1)
@@ -189,17 +187,10 @@ class MixtureResidual(ResidualLearner):
         event = torch.stack([one.event for one in reports]).amax(0)
         return UpdateReport(event, novelty, nis, weight)
 
-    def has_changed(self) -> bool:
-        """Whether the learner that notes changes started again at the last sample."""
-        changes = cast("Host", self.learners[self.watched]).part(DetectChanges)
-        return changes is not None and float(changes.level) == COOL
-
-    def note_return(self, x: Tensor, y: AnyArray, said: AnyArray, nis: float, changed: bool) -> None:
+    def note_return(self, x: Tensor, y: AnyArray, said: AnyArray, nis: float) -> None:
         """After a sample of one model: a regime that is back takes its learner's place, see Returns."""
-        if self.returns is None:
-            return
         i = self.watched
-        if not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis, changed):
+        if self.returns is None or not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis):
             return
         best = self.owner[:, i] > 0
         for experts, most in ((best, 0.0), (~best, -_BEHIND)):

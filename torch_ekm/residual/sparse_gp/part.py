@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -18,6 +17,7 @@ from ..kernels.kernel import Kernel
 from ..recent import Recent
 from ..report import UpdateReport
 from ..running_scale import Units
+from .engine.recursion import absorb
 from .posterior import SparsePosterior
 
 
@@ -50,8 +50,6 @@ class Host(ResidualLearner):
     """Samples before the present one."""
     pending: Tensor
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
-    weighing: tuple[Part, ...]
-    """Parts that weigh samples."""
 
     def _apply(self, fn, recurse=True):
         def keep_double(tensor):
@@ -67,9 +65,12 @@ class Host(ResidualLearner):
         return torch.float64
 
     @property
-    @abstractmethod
     def noise_variance(self) -> Float[Tensor, "*batch out"]:
         """Observation noise variance, in the outputs' own squared units."""
+        noise = self.units.value(self.log_noise_variance.exp(), 2)
+        for part in self._parts:
+            noise = part.noise(noise)
+        return noise
 
     _parts: tuple[Part, ...]
 
@@ -83,13 +84,18 @@ class Host(ResidualLearner):
     parts: nn.ModuleList
     """All of them, in the order in which they act."""
 
-    @abstractmethod
     def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
         """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
+        z, t = self.units.input(x), self.units.output(y)
+        weighing = [part.weigh for part in self._parts if type(part).weigh is not Part.weigh]
+        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, weighing)
 
-    @abstractmethod
     def count_sample(self, *, anew: bool = False) -> None:
         """After a sample and all notes of it: rebuild the caches when it is time, or at once."""
+        n = self.n_samples + 1
+        vars(self)["n_samples"] = n  # an assignment to a Module takes ten times as long
+        if anew or self.is_due(n):
+            self.refresh()
 
     def is_due(self, n: int) -> bool:
         """Whether parts may change the state, and the caches are rebuilt, after n samples."""

@@ -88,7 +88,7 @@ def add_products(A, B, a, out, lower, upper):
         lower: only what lies on and below the diagonal (and a little above).
         upper: A is an upper triangle.
     """
-    n, m, K, sums = A.shape[0], B.shape[0], A.shape[1], np.empty((2, 4))
+    n, m, K = A.shape[0], B.shape[0], A.shape[1]
     for i in range(0, n, 4):
         rows, end, k0 = min(4, n - i), min(m, i + 4) if lower else m, i if upper else 0
         a0, a1 = A[i, k0:], A[min(i + 1, n - 1), k0:]
@@ -105,11 +105,11 @@ def add_products(A, B, a, out, lower, upper):
                 t1 += a1[k] * c[k]
                 t2 += a2[k] * c[k]
                 t3 += a3[k] * c[k]
-            sums[0, 0], sums[0, 1], sums[0, 2], sums[0, 3] = s0, s1, s2, s3
-            sums[1, 0], sums[1, 1], sums[1, 2], sums[1, 3] = t0, t1, t2, t3
-            for r in range(rows):
-                for s in range(min(2, end - j)):
-                    out[i + r, j + s] += a * sums[s, r]
+            for r, (s, t) in enumerate(((s0, t0), (s1, t1), (s2, t2), (s3, t3))):
+                if r < rows:
+                    out[i + r, j] += a * s
+                    if j + 1 < end:
+                        out[i + r, j + 1] += a * t
 
 
 @inner(A2(A2))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 
 from ....typing import Float, Tensor
 from ...kernels.kernel import Kernel
 from ...report import UpdateEvent, UpdateReport
-from ..part import Part
 from ..posterior import SparsePosterior
 
 #: what losses may differ by and count as the same, relative and per output in nats: a basis that has learned
@@ -26,7 +25,7 @@ def absorb(
     kernel: Kernel,
     s2: Float[Tensor, "*batch"],
     mask: Float[Tensor, "*batch"] | None,
-    weighing: Sequence[Part] = (),
+    weighing: Sequence[Callable] = (),
 ) -> tuple[UpdateReport, Tensor, Tensor]:
     """One sample per model, without a branch on data (a mask multiplies every change by 0)::
 
@@ -42,7 +41,7 @@ def absorb(
     Args:
         s2: noise variance of the gain.
         mask: 1 where a model has a sample, 0 elsewhere.
-        weighing: parts whose weights multiply on the gain.
+        weighing: of parts, whose weights multiply on the gain.
 
     Returns:
         The report, the innovation and the latent variance before the update.
@@ -61,8 +60,8 @@ def absorb(
 
     nis = innovation.square().mean(-1) / (s2 + v)
     weight = torch.ones_like(nis)
-    for part in weighing:
-        weight = weight * part.weigh(nis, mask)
+    for weigh in weighing:
+        weight = weight * weigh(nis, mask)
     noise = (s2 + v) / weight - v if weighing else s2
     full = posterior.count == posterior.capacity
     novel = gamma > torch.maximum(posterior.novelty_threshold * prior, LEAST_NOVELTY * s2)
