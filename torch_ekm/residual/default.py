@@ -56,7 +56,7 @@ def default_learner(
     common: dict[str, Any] = {
         "capacity": capacity, "standardize": units, "refresh_every": every, **options
     }  # fmt: skip
-    # no rebuild falls on another large one, or on a large part of a deep kernel's steps
+    # no rebuild of many points falls on another one, or on a part of a deep kernel's steps
     late: list[dict[str, Any]] = [{**common, "refresh_offset": offset} for offset in (0, 8, 18, 30)]
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]

@@ -13,13 +13,14 @@ from torch.distributions import Normal
 
 from ..exceptions import ParameterError
 from ..typing import AnyArray, Float, Tensor
-from . import experts as E
+from . import tails as E
 from .base import ResidualLearner
 from .local_noise import LocalNoise
 from .mixture_engine import CompiledMixture
 from .printed import mixture
 from .report import Expected, MomentsWithJacobians, UpdateReport
 from .returns import Returns
+from .sparse_gp.monitor import DetectChanges
 from .sparse_gp.part import Host
 from .tails import MEMORY, ScaleMixture, ScaleMixtureLaw
 
@@ -126,9 +127,9 @@ class MixtureResidual(ResidualLearner):
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.tails = ScaleMixture(self.out_features, **fleet)
         self.noise = LocalNoise(self.in_features, self.out_features, **fleet)
-        watched = Returns.watched(members)
-        self.watched = -1 if watched is None else watched
-        self.returns = None if watched is None else Returns(cast("Host", members[watched]))
+        noting = (i for i, one in enumerate(members) if isinstance(one, Host) and one.part(DetectChanges))
+        self.watched = -1 if self.batch_shape else next(noting, -1)
+        self.returns = None if self.watched < 0 else Returns(cast("Host", members[self.watched]))
         self._engine = CompiledMixture()
         self._settle()
 

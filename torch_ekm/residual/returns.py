@@ -10,10 +10,9 @@ import torch
 from torch import nn
 
 from ..typing import AnyArray, Tensor
-from .base import ResidualLearner
-from .experts import FREEDOM
 from .sparse_gp.monitor import COOL, DetectChanges
 from .sparse_gp.part import Host
+from .tails import FREEDOM
 
 _KEPT = 2  # regimes
 _EVERY = 64  # samples between two copies of the present state
@@ -41,12 +40,6 @@ class Returns(nn.Module):
         super().__init__()
         self.states = nn.ModuleList(copy.deepcopy(learner) for _ in range(_KEPT + 1))  # the last: the copy
         self.reset()
-
-    @staticmethod
-    def watched(learners: list[ResidualLearner]) -> int | None:
-        """Place of the first learner that notes changes, if there is one of one model."""
-        noting = (i for i, one in enumerate(learners) if isinstance(one, Host) and one.part(DetectChanges))
-        return None if learners[0].batch_shape else next(noting, None)
 
     def reset(self) -> None:
         """No regime is known."""

@@ -1,7 +1,7 @@
 """A step on the lagged prequential loss as compiled loops.
 
 Equations and names are those of :class:`~torch_ekm.residual.LearnHyperparameters` and its
-:class:`~torch_ekm.residual.sparse_gp.prequential_loss.PrequentialLoss`, which torch differentiates itself.
+:class:`~torch_ekm.residual.sparse_gp.hyperparameters.PrequentialLoss`, which torch differentiates itself.
 Here, with ``E = Ck``, ``F = Qk`` and the loss' derivatives ``g`` by mean, variance ``v = k** + k'Ck``,
 ``p = u + k'Ck`` and u of each query::
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import types
 
-from .numba_memory import A1, A2, INT, F, inner, made
+from .numba_memory import A1, A2, INT, F, inner
 
 _EXACT = {"contract"}  # sums in the order in which they stand
 _TO_INTEGER = 6755399441055744.0  # 1.5 * 2^52: its last bits are those of what was added
@@ -19,26 +19,6 @@ _MANTISSA, _ONE = 0xFFFFFFFFFFFFF, 0x3FF0000000000000  # bits of a double: the l
 # Taylor's series, the last term first: e^r up to r^13, artanh(s)/s without the 1 up to s^20
 _OF_EXP = tuple(1.0 / math.factorial(n) for n in range(13, -1, -1))
 _OF_LOG = tuple(1.0 / n for n in range(21, 2, -2))
-
-
-@made
-def _as_float(context, bits):
-    """The double of these bits."""
-
-    def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], context.get_value_type(types.float64))
-
-    return types.float64(types.int64), generate
-
-
-@made
-def _bits(context, value):
-    """The bits of a double."""
-
-    def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], context.get_value_type(types.int64))
-
-    return types.int64(types.float64), generate
 
 
 @inner(F(F), fastmath=_EXACT)
@@ -50,15 +30,15 @@ def exp(x):
     p = 0.0
     for a in _OF_EXP:  # |r| <= ln(2)/2
         p = p * r + a
-    return p * _as_float((_bits(n) << 52) + _ONE)
+    return p * np.int64((np.float64(n).view(np.int64) << 52) + _ONE).view(np.float64)
 
 
 @inner(F(F), fastmath=_EXACT)
 def log(y):
     """ln y of a normal y > 0: ``y = 2^e m``, ``ln m = 2 artanh((m - 1)/(m + 1))``."""
-    bits = _bits(y)
-    e = _as_float((bits >> 52) | 0x4330000000000000) - 4503599627371519.0
-    m = _as_float((bits & _MANTISSA) | _ONE)
+    bits = np.float64(y).view(np.int64)
+    e = np.int64((bits >> 52) | 0x4330000000000000).view(np.float64) - 4503599627371519.0
+    m = np.int64((bits & _MANTISSA) | _ONE).view(np.float64)
     high = m > 1.4142135623730951
     m, e = (0.5 * m if high else m), (e + 1.0 if high else e)
     s = (m - 1.0) / (m + 1.0)
