@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from collections.abc import Iterable
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -17,7 +18,6 @@ from ..kernels.kernel import Kernel
 from ..recent import Recent
 from ..report import UpdateReport
 from ..running_scale import Units
-from .engine.recursion import absorb
 from .posterior import SparsePosterior
 
 
@@ -84,11 +84,9 @@ class Host(ResidualLearner):
     parts: nn.ModuleList
     """All of them, in the order in which they act."""
 
+    @abstractmethod
     def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
         """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
-        z, t = self.units.input(x), self.units.output(y)
-        weighing = [part.weigh for part in self._parts if type(part).weigh is not Part.weigh]
-        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, weighing)
 
     def count_sample(self, *, anew: bool = False) -> None:
         """After a sample and all notes of it: rebuild the caches when it is time, or at once."""

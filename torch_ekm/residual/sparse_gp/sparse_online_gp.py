@@ -18,6 +18,7 @@ from ..recent import Recent
 from ..report import MomentsWithJacobians, UpdateReport
 from ..running_scale import BLOCK, RunningScale, Units
 from .engine.compiled import CompiledEngine
+from .engine.recursion import absorb
 from .forgetting import ProcessNoise
 from .hyperparameters import LearnHyperparameters
 from .monitor import CalibrateNoise, DetectChanges, RobustWeight
@@ -257,6 +258,12 @@ class SparseOnlineGP(Host):
             part.act(self)
         self.count_sample(anew=anew)
         return sample.report
+
+    def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
+        """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
+        z, t = self.units.input(x), self.units.output(y)
+        weighing = [part for part in self._parts if type(part).weigh is not Part.weigh]
+        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, weighing)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""

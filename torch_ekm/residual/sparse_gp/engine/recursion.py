@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 
 from ....typing import Float, Tensor
 from ...kernels.kernel import Kernel
 from ...report import UpdateEvent, UpdateReport
+from ..part import Part
 from ..posterior import SparsePosterior
 
 #: what losses may differ by and count as the same, relative and per output in nats: a basis that has learned
@@ -25,7 +26,7 @@ def absorb(
     kernel: Kernel,
     s2: Float[Tensor, "*batch"],
     mask: Float[Tensor, "*batch"] | None,
-    weighing: Sequence[Callable] = (),
+    weighing: Sequence[Part] = (),
 ) -> tuple[UpdateReport, Tensor, Tensor]:
     """One sample per model, without a branch on data (a mask multiplies every change by 0)::
 
@@ -41,7 +42,7 @@ def absorb(
     Args:
         s2: noise variance of the gain.
         mask: 1 where a model has a sample, 0 elsewhere.
-        weighing: of parts, whose weights multiply on the gain.
+        weighing: parts whose weights multiply on the gain.
 
     Returns:
         The report, the innovation and the latent variance before the update.
@@ -60,8 +61,8 @@ def absorb(
 
     nis = innovation.square().mean(-1) / (s2 + v)
     weight = torch.ones_like(nis)
-    for weigh in weighing:
-        weight = weight * weigh(nis, mask)
+    for part in weighing:
+        weight = weight * part.weigh(nis, mask)
     noise = (s2 + v) / weight - v if weighing else s2
     full = posterior.count == posterior.capacity
     novel = gamma > torch.maximum(posterior.novelty_threshold * prior, LEAST_NOVELTY * s2)
