@@ -153,7 +153,7 @@ def test_compiled_steps_and_rebuilds_are_those_of_torch(name, shape, memory):
 
 @numba_here
 @pytest.mark.parametrize("shape", [(), (3,)])
-def test_compiled_units_are_those_of_numpy(shape):
+def test_compiled_units_are_those_of_torch(shape):
     generator = torch.Generator().manual_seed(0)
     gp, other = (SparseOnlineGP(D, M, parts=[Standardize()], batch_shape=shape) for _ in range(2))
     for k in range(6):

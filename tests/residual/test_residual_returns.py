@@ -48,9 +48,9 @@ def test_after_a_reset_no_regime_is_known():
     x, y = there_and_back(1)
     learner.update(x[:400], y[:400])
     assert learner.returns is not None
-    assert learner.returns.evidence
+    assert learner.returns.known["evidence"]
     learner.reset()
-    assert not learner.returns.evidence
+    assert not learner.returns.known["evidence"]
 
 
 def test_without_a_learner_that_notes_changes_nothing_is_kept():

@@ -14,7 +14,6 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     Standardize,
     default_learner,
-    running_scale,
 )
 from torch_ekm.residual.running_scale import BLOCK, RunningScale
 
@@ -178,32 +177,3 @@ def test_bursts_are_no_outliers():
         found.append(float(scale.scale))
     assert found[0] > 0.04
     assert found[1] < 0.03
-
-
-@pytest.mark.parametrize("fleet", [(), (3,)])
-def test_arrays_are_pooled_as_tensors_are(fleet, monkeypatch):
-    shifted, generator = [True, True, False, True, True], torch.Generator().manual_seed(1)
-    ours, theirs = (RunningScale(5, shifted, batch_shape=fleet) for _ in range(2))
-    offset, unit = torch.tensor([[0.0, 3.0, 0.0, 1e3, 0.0], [1.0, 1e-6, 1e8, 1.0, 1.0]]).double()
-    for block in range(50):
-        x = offset + unit * torch.randn(BLOCK, *fleet, 5, generator=generator, dtype=torch.float64)
-        on = torch.rand(BLOCK, *fleet, generator=generator).double() < (0.7 if block != 7 else 0.0)
-        x[::7, ..., 0] *= 30.0 if block % 3 else 1.0  # outliers
-        x[5:12, ..., 4] *= 100.0 if block % 4 else 1.0  # a burst
-        if block % 5 == 2:  # at rest
-            x[..., 3] = 7.0
-        if block == 40:
-            x[..., 1] *= 1e-30
-        on, x = (on | bool(block % 2)).double().movedim(0, -1), x.movedim(0, -2)
-        for scale, plain in ((ours, running_scale.is_plain), (theirs, lambda *_: False)):
-            with monkeypatch.context() as patch:
-                patch.setattr(running_scale, "is_plain", plain)
-                scale.pool(x, on)
-        for name in ("weight", "centre", "spread", "large"):
-            torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-10, atol=1e-300)
-        if block % 3 == 0:
-            changed, change = ours.settle(), theirs.settle()
-            assert (changed is None) == (change is None)
-            if changed is not None and change is not None:
-                assert torch.equal(changed[1] != 1.0, change[1] != 1.0)
-    assert 0 < float(ours.large[..., 4, 1].max()) < float(ours.large[..., 4, 0].min())

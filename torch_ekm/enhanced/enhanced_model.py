@@ -17,7 +17,7 @@ from ..exceptions import FileFormatError, NoStateError, ParameterError, ShapeErr
 from ..kinematics import GraspState
 from ..residual.base import ResidualLearner
 from ..residual.files import known_classes, read, rebuild, write
-from ..residual.kernels.action_linear import ActionLinearKernel
+from ..residual.kernels.linear import ActionLinearKernel
 from ..residual.report import Expected, UpdateReport
 from ..typing import Float, Tensor
 from .adaptive_model import differentiated, finite_differences

@@ -7,20 +7,18 @@ from .baselines.linear import RandomFeatureRLS, RecursiveLeastSquares
 from .baselines.replay_mlp import ReplayMLP
 from .baselines.zero import ZeroResidual
 from .default import default_learner
-from .kernels.action_linear import ActionLinearKernel
 from .kernels.deep import DeepKernel
 from .kernels.kernel import Kernel
-from .kernels.linear import LinearKernel
+from .kernels.linear import ActionLinearKernel, LinearKernel
 from .kernels.stationary import Matern32, SquaredExponential
 from .mixture import MixtureResidual
 from .mixture_engine import warm_up
 from .report import Expected, UpdateEvent, UpdateReport
-from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import CalibrateNoise, DetectChanges, RobustWeight
 from .sparse_gp.part import Part
-from .sparse_gp.sparse_online_gp import SparseOnlineGP
+from .sparse_gp.sparse_online_gp import DeepKernelSOGP, SparseOnlineGP
 from .sparse_gp.units import Standardize
 
 __all__ = [

@@ -42,16 +42,12 @@ class Adam(nn.Module):
         mask: Bool[Tensor, "*shape"] | None = None,
     ) -> None:
         """One step of the i-th parameter, in place; entries outside ``mask`` and their moments stay."""
-        first, second = getattr(self, f"first_{i}"), getattr(self, f"second_{i}")
+        first, second = self.get_buffer(f"first_{i}"), self.get_buffer(f"second_{i}")
         b1, b2 = self.betas
-        if mask is None:
-            first.lerp_(gradient, 1 - b1)
-            second.mul_(b2).addcmul_(gradient, gradient, value=1 - b2)
-        else:
-            first.copy_(torch.where(mask, b1 * first + (1 - b1) * gradient, first))
-            second.copy_(torch.where(mask, b2 * second + (1 - b2) * gradient**2, second))
-        step = (rate * first).div_(second.sqrt().add_(1e-8))
-        p.sub_(step if mask is None else step.where(mask, 0.0))
+        m, v = first.lerp(gradient, 1 - b1), (b2 * second).addcmul_(gradient, gradient, value=1 - b2)
+        moved = p - (rate * m).div_(v.sqrt().add_(1e-8))
+        for kept, new in ((first, m), (second, v), (p, moved)):
+            kept.copy_(new if mask is None else new.where(mask, kept))
 
     def reset(self) -> None:
         """Forget the moments of all parameters, as before the first step."""

@@ -9,11 +9,10 @@ from .kernels.kernel import fleet_options
 from .kernels.linear import LinearKernel
 from .kernels.stationary import Matern32
 from .mixture import MixtureResidual
-from .sparse_gp.deep import DeepKernelSOGP
 from .sparse_gp.forgetting import ForgettingFactor, ProcessNoise
 from .sparse_gp.hyperparameters import LearnHyperparameters
 from .sparse_gp.monitor import DetectChanges, RobustWeight
-from .sparse_gp.sparse_online_gp import SparseOnlineGP
+from .sparse_gp.sparse_online_gp import DeepKernelSOGP, SparseOnlineGP
 from .sparse_gp.units import Standardize
 
 _OPTIONS = ("dtype", "device", "batch_shape", "on_invalid")
@@ -57,8 +56,8 @@ def default_learner(
     common: dict[str, Any] = {
         "capacity": capacity, "standardize": units, "refresh_every": every, **options
     }  # fmt: skip
-    # no two rebuilds fall together, nor one and the step that a deep kernel takes halfway between its own
-    late: list[dict[str, Any]] = [{**common, "refresh_offset": offset} for offset in (0, 12, 6, 5)]
+    # no rebuild of many points falls on another one, or on a part of a deep kernel's steps
+    late: list[dict[str, Any]] = [{**common, "refresh_offset": offset} for offset in (0, 8, 18, 30)]
     fleet = fleet_options(options)
     wanders = [RobustWeight(3.0), ProcessNoise(0.003), LearnHyperparameters()]
     fades = [RobustWeight(3.0), ForgettingFactor(0.998), LearnHyperparameters()]

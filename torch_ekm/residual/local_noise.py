@@ -19,7 +19,7 @@ FLOOR, MOST = 0.1, 20.0  #: added to |z|, whose logarithm has no end; and where 
 CENTRE = 0.363  #: mean of -log(|z| + FLOOR) of a normal z
 REACH = 4.0  #: of f
 _CAPACITY, _VARIANCE = 30, 0.3  # of f
-_OFFSET = 1  # samples by which its rebuilds come later than the default's first, as it begins 4 later
+_OFFSET = 2  # of its rebuilds, which come 4 later than the default's, as it begins 4 later
 
 
 class LocalNoise(nn.Module):

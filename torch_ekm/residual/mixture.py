@@ -13,14 +13,14 @@ from torch.distributions import Normal
 
 from ..exceptions import ParameterError
 from ..typing import AnyArray, Float, Tensor
-from . import experts as E
+from . import tails as E
 from .base import ResidualLearner
 from .local_noise import LocalNoise
 from .mixture_engine import CompiledMixture
 from .printed import mixture
 from .report import Expected, MomentsWithJacobians, UpdateReport
 from .returns import Returns
-from .sparse_gp.monitor import COOL, DetectChanges
+from .sparse_gp.monitor import DetectChanges
 from .sparse_gp.part import Host
 from .tails import MEMORY, ScaleMixture, ScaleMixtureLaw
 
@@ -127,9 +127,9 @@ class MixtureResidual(ResidualLearner):
         fleet = {"batch_shape": self.batch_shape, **factory}
         self.tails = ScaleMixture(self.out_features, **fleet)
         self.noise = LocalNoise(self.in_features, self.out_features, **fleet)
-        watched = Returns.watched(members)
-        self.watched = -1 if watched is None else watched
-        self.returns = None if watched is None else Returns(cast("Host", members[watched]))
+        noting = (i for i, one in enumerate(members) if isinstance(one, Host) and one.part(DetectChanges))
+        self.watched = -1 if self.batch_shape else next(noting, -1)
+        self.returns = None if self.watched < 0 else Returns(cast("Host", members[self.watched]))
         self._engine = CompiledMixture()
         self._settle()
 
@@ -179,8 +179,7 @@ class MixtureResidual(ResidualLearner):
         nis, *said = self._judged(x, y, mask, moments, sooner)
         reports = [learner.step(x, y, mask) for learner in self.members]
         if self.returns is not None and (mask is None or bool(mask)):
-            figures = y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis), self.has_changed()
-            self.note_return(x, *figures)
+            self.note_return(x, y.cpu().numpy(), torch.stack(said).cpu().numpy(), float(nis))
         part = self.weights.mean(-2)  # of each learner, over the outputs
         novelty, weight = (
             (part * torch.stack(each, dim=-1).to(part)).sum(-1)
@@ -189,17 +188,10 @@ class MixtureResidual(ResidualLearner):
         event = torch.stack([one.event for one in reports]).amax(0)
         return UpdateReport(event, novelty, nis, weight)
 
-    def has_changed(self) -> bool:
-        """Whether the learner that notes changes started again at the last sample."""
-        changes = cast("Host", self.learners[self.watched]).part(DetectChanges)
-        return changes is not None and float(changes.level) == COOL
-
-    def note_return(self, x: Tensor, y: AnyArray, said: AnyArray, nis: float, changed: bool) -> None:
+    def note_return(self, x: Tensor, y: AnyArray, said: AnyArray, nis: float) -> None:
         """After a sample of one model: a regime that is back takes its learner's place, see Returns."""
-        if self.returns is None:
-            return
         i = self.watched
-        if not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis, changed):
+        if self.returns is None or not self.returns.observe(cast("Host", self.learners[i]), x, y, said, nis):
             return
         best = self.owner[:, i] > 0
         for experts, most in ((best, 0.0), (~best, -_BEHIND)):

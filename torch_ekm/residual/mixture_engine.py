@@ -61,7 +61,7 @@ class CompiledMixture(Engine):
         shapes = ((n, *s) if want else (0,) for s, want in zip((one, one, two, two), wants, strict=True))
         told = [x.new_empty(shape) for shape in shapes]  # by each learner
         each, sizes = [t.data_ptr() for t in told], [8 * t.numel() // n for t in told]
-        loops: Any = load_loops()
+        loops = load_loops()
         for i, plan in enumerate(self._plans if wants[1] else self._plans[:-1]):
             at = (begin + i * size for begin, size in zip(each, sizes, strict=True))
             loops.query_fleet(plan.row, False, x.data_ptr(), *at)
@@ -76,11 +76,10 @@ class CompiledMixture(Engine):
         pairs = list(zip(self._plans, self._learners, strict=True))
         if any(plan.is_rough(one) for plan, one in pairs):  # what it predicts would be another after that
             return None
-        loops: Any = load_loops()
         x, y = x.contiguous(), y.contiguous()
         of_all, said = np.empty((4, len(bound.all))), np.empty((2, y.numel()))
         numbers = np.array([one.n_samples for one in self._learners])
-        alarm = loops.update_mixture(
+        alarm = load_loops().update_mixture(
             bound.row, self._members, numbers, on_array(bound, mask), x.data_ptr(), y.data_ptr(), said, of_all
         )
         if alarm < 0:  # not finite
@@ -89,7 +88,7 @@ class CompiledMixture(Engine):
             if i < len(pairs) - 1 or alarm >> i & 1:  # the last one's bit: the noise has learned
                 plan.act(one, bool(alarm >> i & 1))
         if g.returns is not None and (mask is None or bool(mask)):
-            g.note_return(x, y.numpy(), said, float(of_all[0, 0]), bool(alarm >> g.watched & 1))
+            g.note_return(x, y.numpy(), said, float(of_all[0, 0]))
         nis, novelty, weight, event = torch.from_numpy(of_all.reshape(4, *g.batch_shape)).unbind()
         return UpdateReport(event.to(torch.int64), novelty, nis, weight)
 

@@ -12,8 +12,8 @@ import math
 import numpy as np
 from numba import types
 
-from . import experts as E
 from . import local_noise as L
+from . import tails as E
 from .base import FARTHEST as FARTHEST_MEAN
 from .sparse_gp import plan as P
 from .sparse_gp.engine.numba_math import exp, log

@@ -13,8 +13,8 @@ import math
 import numpy as np
 from numba import njit, types
 
-from . import experts as E
 from . import local_noise as L
+from . import tails as E
 from .base import FARTHEST as FARTHEST_MEAN
 from .numba_judge import judge, make_finite, mean_of, scatter_of, share_of_noise
 from .sparse_gp import plan as P

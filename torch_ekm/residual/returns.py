@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import nn
 
 from ..typing import AnyArray, Tensor
-from .base import ResidualLearner
-from .experts import FREEDOM
-from .sparse_gp.monitor import DetectChanges
+from .sparse_gp.monitor import COOL, DetectChanges
 from .sparse_gp.part import Host
+from .tails import FREEDOM
 
 _KEPT = 2  # regimes
 _EVERY = 64  # samples between two copies of the present state
@@ -42,73 +41,56 @@ class Returns(nn.Module):
         self.states = nn.ModuleList(copy.deepcopy(learner) for _ in range(_KEPT + 1))  # the last: the copy
         self.reset()
 
-    @staticmethod
-    def watched(learners: list[ResidualLearner]) -> int | None:
-        """Place of the first learner that notes changes, if there is one of one model."""
-        noting = (i for i, one in enumerate(learners) if isinstance(one, Host) and one.part(DetectChanges))
-        return None if learners[0].batch_shape else next(noting, None)
-
     def reset(self) -> None:
         """No regime is known."""
-        self.evidence: list[float] = []
-        self.is_copied, self.n, self.rest = False, 0, _REST
+        self.known: dict[str, Any] = {"is_copied": False, "n": 0, "rest": _REST, "evidence": []}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """What is known of the states."""
-        known = {name: getattr(self, name) for name in ("is_copied", "n", "rest")}
-        return {**known, "evidence": list(self.evidence)}
+        """What is known of the states: log evidence of each old one, and whether there is a copy."""
+        return copy.deepcopy(self.known)
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """See :meth:`get_extra_state`."""
-        for name, value in state.items():
-            setattr(self, name, list(value) if name == "evidence" else value)
+        self.known = copy.deepcopy(state)
 
-    def observe(
-        self, learner: Host, x: Tensor, y: AnyArray, said: AnyArray, nis: float, changed: bool
-    ) -> bool:
+    def observe(self, learner: Host, x: Tensor, y: AnyArray, said: AnyArray, nis: float) -> bool:
         """Take note of a sample that was learned; whether the learner is in an old state from now on.
 
-        Args:
-            changed: whether the learner has started again.
-            said: mean of the mixture before, and its typical deviation, ``(2, out)``.
+        ``said``: mean of the mixture before, and its typical deviation, ``(2, out)``.
         """
-        known = vars(self)  # an assignment to a Module takes ten times as long
-        known["n"], known["rest"] = self.n + 1, max(self.rest - 1, 0)
-        if not (changed or self.evidence or self.n % _EVERY == 0):
+        level = float(cast("DetectChanges", learner.part(DetectChanges)).level)
+        changed = level == COOL  # at the last sample: the learner has started again
+        known, evidence, rest = self.known, self.known["evidence"], max(self.known["rest"] - 1, 0)
+        known["n"], known["rest"] = known["n"] + 1, rest
+        due = known["n"] % _EVERY == 0
+        if not (changed or evidence or due):
             return False
         states = self.states
-        if self.evidence and (nis > _SURPRISE or any(self.evidence)):
+        if evidence and (nis > _SURPRISE or any(evidence)):
             j = self._judge(x, y, said)
-            if self.evidence[j] > _ENOUGH and not self.rest:
+            if evidence[j] > _ENOUGH and not rest:
                 copy_state(states[_KEPT], learner)
                 copy_state(learner, states[j])
                 states[j], states[_KEPT] = states[_KEPT], states[j]
-                known |= {"evidence": [0.0] * len(self.evidence), "is_copied": False, "rest": _REST}
+                known |= {"evidence": [0.0] * len(evidence), "is_copied": False, "rest": _REST}
                 return True
-        if changed and self.is_copied:
-            kept, new = list(states[:_KEPT]), states[_KEPT]
-            at = len(self.evidence)
+        if changed and known["is_copied"]:
+            kept, new, at = list(states[:_KEPT]), states[_KEPT], len(evidence)
             order = [*kept[:at], new, *kept[at:]] if at < _KEPT else [*kept[1:], new, kept[0]]
             for place, state in enumerate(order):
                 states[place] = state
             known |= {"evidence": [0.0] * min(at + 1, _KEPT), "is_copied": False, "rest": _REST}
-        elif self.n % _EVERY == 0 and not self.rest and _is_calm(learner):
+        elif due and not rest and _CALM[0] < level < _CALM[1]:
             known["is_copied"] = True
             copy_state(states[_KEPT], learner)
         return False
 
     def _judge(self, x: Tensor, y: AnyArray, said: AnyArray) -> int:
         """The state that fits best, after this sample."""
-        most = min(_cost(y, said[0], said[1]), _MOST)
-        for j, before in enumerate(self.evidence):
+        most, evidence = min(_cost(y, said[0], said[1]), _MOST), self.known["evidence"]
+        for j, before in enumerate(evidence):
             mean = self.states[j](x).cpu().numpy()
-            self.evidence[j] = max(0.0, _MEMORY * before + most - _cost(y, mean, said[1]))
-        return int(np.argmax(self.evidence))
-
-
-def _is_calm(learner: Host) -> bool:
-    changes = learner.part(DetectChanges)
-    return changes is not None and _CALM[0] < float(changes.level) < _CALM[1]
+            evidence[j] = max(0.0, _MEMORY * before + most - _cost(y, mean, said[1]))
+        return int(np.argmax(evidence))
 
 
 def _cost(y: AnyArray, mean: AnyArray, deviation: AnyArray) -> float:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,7 @@ import torch
 from torch import nn
 
 from .._arrays import is_plain, namespace
-from ..typing import AnyArray, Bool, Float, Tensor
+from ..typing import Bool, Float, Tensor
 
 BLOCK = 32  #: samples of a block
 TRIMMED = (8.0, 4.0)  # an eighth, or a fourth of a block
@@ -103,7 +102,7 @@ class RunningScale(nn.Module):
         """Take samples in, in their order, of the models where ``on`` is 1."""
         pooled = self.weight, self.centre, self.spread, self.large
         for buffer, found in zip(pooled, _pooled(self, block, on), strict=True):
-            buffer.copy_(torch.as_tensor(found))
+            buffer.copy_(found)
 
     def settle(self, *young: Tensor, settled: float = 0.1) -> tuple[Tensor, Tensor] | None:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
@@ -114,15 +113,13 @@ class RunningScale(nn.Module):
             young: a block as of :meth:`pool` that counts, too; every change is worth new units then.
             settled: relative change of a scale (of a shift in units of it) that is not worth new units.
         """
-        kept = self.weight, self.centre, self.spread, self.scale, self.shift, self.least
-        # in numpy, see _arrays, where these are numbers alone
-        now: Any = [t.numpy() for t in kept] if is_plain(self.scale) else kept
-        weight, centre, spread = (_pooled(self, *young) if young else now)[:3]
-        (old_scale, old_shift, least), xp = now[3:], namespace(now[0])
+        found = _pooled(self, *young)[:3] if young else (self.weight, self.centre, self.spread)
+        now: Any = *found, self.scale, self.shift, self.least
+        now = [t.numpy() for t in now] if is_plain(self.scale) else now  # see _arrays: small operations
+        (weight, centre, spread, old_scale, old_shift, least), xp = now, namespace(now[0])
         kind = torch.finfo(self.scale.dtype)
         usable = (spread > 100 * kind.eps * abs(centre)) & (spread > kind.tiny)
-        first = xp.where(least > 0, least, 1.0)
-        scale = xp.where(usable, xp.maximum(spread, least), first)
+        scale = xp.where(usable, xp.maximum(spread, least), xp.where(least > 0, least, 1.0))
         off = xp.maximum(scale / old_scale, old_scale / scale) - 1.0
         off = off + abs(centre - old_shift) / xp.minimum(scale, old_scale)
         change = (weight > 0) & (off > (0.0 if young else settled))
@@ -190,71 +187,60 @@ class Units(nn.Module):
         self.output.reset()
 
 
-def _pooled(scale: RunningScale, block: Tensor, on: Tensor) -> tuple[AnyArray, ...]:
+def _pooled(
+    at: RunningScale, block: Float[Tensor, "*batch n features"], on: Float[Tensor, "*batch n"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Weight, centre, spread and large samples of the past and the block together."""
-    names = "shifted", "weight", "centre", "spread", "large"
-    tensors = block, on.unsqueeze(-1), *map(scale.get_buffer, names)
-    # in numpy, see _arrays, where these are numbers alone
-    kept = [t.numpy() for t in tensors] if is_plain(*tensors) else tensors
-    at = SimpleNamespace(memory=scale.memory, **dict(zip(("block", "block_on", *names), kept, strict=True)))
-    xp, tiny = namespace(at.block), torch.finfo(block.dtype).tiny
-    count, centre, spread, large = _of_block(at, tiny)
-    share, *drop = REST[0], *(xp.asarray(value, dtype=at.block.dtype) for value in (REST[1], 1.0))
-    past = xp.where((spread == 0) | (spread > ALIEN * at.spread), at.spread, 0.0)
-    count = count * xp.where(spread < share * past, *drop)
-    before = xp.where(past == at.spread, at.weight.clip(None, at.memory), 0.0)
+    tiny = torch.finfo(block.dtype).tiny
+    count, centre, spread, large = _of_block(at, block, on.unsqueeze(-1), tiny)
+    past = torch.where((spread == 0) | (spread > ALIEN * at.spread), at.spread, 0.0)
+    count = torch.where(spread < REST[0] * past, REST[1] * count, count)
+    before = torch.where(past == at.spread, at.weight.clamp_max(at.memory), 0.0)
     weight = before + count
-    part = count / weight.clip(tiny)
-    gap = xp.where(before > 0, centre - at.centre, 0.0)
-    most = xp.maximum(xp.maximum(abs(gap), past), spread).clip(tiny)
+    part = count / weight.clamp_min(tiny)
+    gap = torch.where(before > 0, centre - at.centre, 0.0)
+    most = torch.maximum(torch.maximum(gap.abs(), past), spread).clamp_min(tiny)
     # mean of roots: a block full of outliers does not decide either
     inside = (1.0 - part) * (past / most) ** 0.5 + part * (spread / most) ** 0.5
     variance = inside**4 + (1.0 - part) * part * (gap / most) ** 2
-    start = xp.where(before > 0, at.centre, centre)
+    start = torch.where(before > 0, at.centre, centre)
     return weight, start + part * gap, most * variance**0.5, large
 
 
-def _of_block(at: SimpleNamespace, tiny: float) -> tuple[AnyArray, ...]:
+def _of_block(at: RunningScale, block: Tensor, block_on: Tensor, tiny: float) -> tuple[Tensor, ...]:
     """Number of samples, centre and spread of the block without its outliers; large ones up to now."""
-    xp, on = namespace(at.block), at.block_on > 0
-    count = at.block_on.sum(-2)
-    n, rank = count[..., None, :], xp.arange(at.block.shape[-2], device=at.block.device)[:, None]
-    ordered = _sorted(xp.where(on, at.block, xp.inf))
-    middle = xp.where(rank == (n - 1.0).clip(0.0) // 2, ordered, 0.0).sum(-2)
-    middle = xp.where(at.shifted * count > 0, middle, 0.0)
-    away = xp.where(on, at.block - middle[..., None, :], 0.0)
-    most = xp.amax(abs(away), -2).clip(tiny)
-    away = away / most[..., None, :]
+    on, count = block_on > 0, block_on.sum(-2)
+    n, rank = count.unsqueeze(-2), torch.arange(block.shape[-2], device=block.device).unsqueeze(-1)
+    ordered = torch.where(on, block, torch.inf).sort(-2).values
+    middle = torch.where(rank == (n - 1.0).clamp_min(0.0) // 2, ordered, 0.0).sum(-2)
+    middle = torch.where(at.shifted * count > 0, middle, 0.0)
+    away = torch.where(on, block - middle.unsqueeze(-2), 0.0)
+    most = away.abs().amax(-2).clamp_min(tiny)
+    away = away / most.unsqueeze(-2)
     # those farthest out are left out of the measure by which they are cut
-    squares = _sorted(xp.where(on, away**2, xp.inf))
+    squares = torch.where(on, away**2, torch.inf).sort(-2).values
     few, many = (
-        (xp.where(kept, squares, 0.0).sum(-2) / kept.sum(-2).clip(1)) ** 0.5
-        for kept in (rank < n - xp.ceil(n / part) for part in TRIMMED)
+        (torch.where(kept, squares, 0.0).sum(-2) / kept.sum(-2).clamp_min(1)) ** 0.5
+        for kept in (rank < n - (n / part).ceil() for part in TRIMMED)
     )
-    typical = xp.where(many > SPIKES * few, many, few)
-    bound = xp.where(typical > 0, CLIP * typical, 1.0)
-    large, bursts = _in_company(at, abs(away) > bound[..., None, :], count)
-    bound = (bound * xp.where(bursts, BURST_CLIP, 1.0))[..., None, :]
-    away = xp.minimum(xp.maximum(away, -bound), bound)
-    n = count.clip(1.0)
+    typical = torch.where(many > SPIKES * few, many, few)
+    bound = torch.where(typical > 0, CLIP * typical, 1.0)
+    large, bursts = _in_company(at, away.abs() > bound.unsqueeze(-2), count)
+    bound = torch.where(bursts, BURST_CLIP * bound, bound).unsqueeze(-2)
+    away = torch.minimum(torch.maximum(away, -bound), bound)
+    n = count.clamp_min(1.0)
     mean = (away.sum(-2) / n) * at.shifted
-    spread = ((away - mean[..., None, :]) ** 2 * at.block_on).sum(-2) / n
+    spread = ((away - mean.unsqueeze(-2)) ** 2 * block_on).sum(-2) / n
     return count + 0 * mean, middle + most * mean, most * spread**0.5, large
 
 
-def _in_company(at: SimpleNamespace, large: AnyArray, count: AnyArray) -> tuple[AnyArray, AnyArray]:
+def _in_company(at: RunningScale, large: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
     """Counts of large samples with those of this block, and whether they come in bursts."""
-    xp = namespace(large)
-    near = xp.zeros_like(large)
+    near = torch.zeros_like(large)
     near[..., 1:, :] = large[..., :-1, :]
     near[..., :-1, :] |= large[..., 1:, :]
-    found = xp.stack([large.sum(-2), (large & ~near).sum(-2)], -1)
+    found = torch.stack([large.sum(-2), (large & ~near).sum(-2)], -1)
     counts = at.large * (1.0 - BLOCK / at.memory) + found
-    share = counts[..., 0] / (at.weight.clip(None, at.memory) + count).clip(1.0)
-    by_chance = (1.0 - share.clip(None, 1.0)) ** 2
+    share = counts[..., 0] / (at.weight.clamp_max(at.memory) + count).clamp_min(1.0)
+    by_chance = (1.0 - share.clamp_max(1.0)) ** 2
     return counts, counts[..., 1] + DOUBT < COMPANY * by_chance * (counts[..., 0] + DOUBT)
-
-
-def _sorted(x: AnyArray) -> AnyArray:
-    """Each column in order."""
-    return x.sort(-2).values if isinstance(x, Tensor) else np.sort(x, -2)

@@ -11,8 +11,8 @@ from torch import nn
 
 from ..._checks import check_count, check_fraction, check_positive
 from ...typing import Bool, Float, Tensor
+from ..base import joint_draws
 from ..kernels.kernel import log_parameter
-from ..predictions import joint_draws
 from ..report import UpdateReport
 from ..running_scale import BLOCK
 from .scaled import ScaledLearner

@@ -80,7 +80,7 @@ class DeepKernel(Kernel):
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         a = self.embed(x)
         d2 = squared_distances(a, a if z is x else self.embed(z))
-        return self.base.log_variance.exp()[..., None, None] * self.base.phi(d2)
+        return self.base.log_variance.exp()[..., None, None] * self.base.phi_psi(d2)[0]
 
     def diagonal(self, x: Tensor) -> Tensor:
         return self.base.diagonal(x)

@@ -74,16 +74,11 @@ class StationaryKernel(Kernel):
     def phi_psi(d2: Tensor) -> tuple[Tensor, Tensor]:
         """Correlation phi and ``psi = -2 dphi/d(d2)`` at the squared scaled distance."""
 
-    @classmethod
-    def phi(cls, d2: Tensor) -> Tensor:
-        """Correlation phi at the squared scaled distance ``d2``, 1 at 0."""
-        return cls.phi_psi(d2)[0]
-
     def forward(self, x: Tensor, z: Tensor) -> Tensor:
         w = self.log_lengthscale.neg().exp().unsqueeze(-2)
         scaled = x * w
         d2 = squared_distances(scaled, scaled if z is x else z * w)
-        return self.log_variance.exp()[..., None, None] * self.phi(d2)
+        return self.log_variance.exp()[..., None, None] * self.phi_psi(d2)[0]
 
     def diagonal(self, x: Tensor) -> Tensor:
         return self.log_variance.exp().expand(x.shape[:-1])

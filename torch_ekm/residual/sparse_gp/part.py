@@ -50,8 +50,6 @@ class Host(ResidualLearner):
     """Samples before the present one."""
     pending: Tensor
     """Samples of each model since the caches were made, ``(*batch_shape)``."""
-    weighing: tuple[Part, ...]
-    """Parts that weigh samples."""
 
     def _apply(self, fn, recurse=True):
         def keep_double(tensor):
@@ -67,9 +65,12 @@ class Host(ResidualLearner):
         return torch.float64
 
     @property
-    @abstractmethod
     def noise_variance(self) -> Float[Tensor, "*batch out"]:
         """Observation noise variance, in the outputs' own squared units."""
+        noise = self.units.value(self.log_noise_variance.exp(), 2)
+        for part in self._parts:
+            noise = part.noise(noise)
+        return noise
 
     _parts: tuple[Part, ...]
 
@@ -87,9 +88,12 @@ class Host(ResidualLearner):
     def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
         """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
 
-    @abstractmethod
     def count_sample(self, *, anew: bool = False) -> None:
         """After a sample and all notes of it: rebuild the caches when it is time, or at once."""
+        n = self.n_samples + 1
+        vars(self)["n_samples"] = n  # an assignment to a Module takes ten times as long
+        if anew or self.is_due(n):
+            self.refresh()
 
     def is_due(self, n: int) -> bool:
         """Whether parts may change the state, and the caches are rebuilt, after n samples."""

@@ -16,6 +16,7 @@ from __future__ import annotations
     BASIS, ACTIVE, COUNT, SLOT, MOMENTS, VECTORS, PENDING, LARGEST, LOG_NOISE,
     LOG_LENGTHSCALE, LOG_VARIANCE, LOG_ACTION, SHIFT, SCALE, SHIFT_Y, SCALE_Y, REACH,
     EMBEDDED,  # the basis as the kernel sees it
+    LAYERED,  # the basis with all layers of a network behind
     LAYERS, NETWORK,  # of a deep kernel: rows of widths before and behind a layer, addresses of weights,
     # biases (0: the last layer has none) and weights the other way round
     ROOM,  # for what an update finds of its sample
@@ -30,7 +31,7 @@ from __future__ import annotations
     SUMS,  # of the queries of a step so far
     RATES,  # of a step, square of a robust weight's threshold (0: none), factor of forgetting
     FIELDS,
-) = range(47)  # fmt: skip
+) = range(48)  # fmt: skip
 #: of a mixture behind these, of which it has MODELS, IN, OUT and LARGEST
 (
     N_EXPERTS, N_SHARES, N_TAILS,

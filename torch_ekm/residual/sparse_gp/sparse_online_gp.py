@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import torch
@@ -9,9 +9,10 @@ from torch.distributions import Normal
 
 from ..._checks import check_count
 from ...typing import Float, Tensor
-from ..kernels.kernel import Kernel, check_kernel, log_parameter
-from ..kernels.stationary import Matern32
-from ..predictions import joint_draws
+from ..base import joint_draws
+from ..kernels.deep import DeepKernel
+from ..kernels.kernel import Kernel, check_kernel, fleet_options, log_parameter
+from ..kernels.stationary import Matern32, StationaryKernel
 from ..printed import sparse_gp
 from ..recent import Recent
 from ..report import MomentsWithJacobians, UpdateReport
@@ -115,7 +116,6 @@ class SparseOnlineGP(Host):
             part.bind(self)
             self._parts += (part,)
         self.parts = nn.ModuleList(self._parts)
-        self.weighing = tuple(part for part in self._parts if type(part).weigh is not Part.weigh)
 
     # -- predictions ----------------------------------------------------------------------------
 
@@ -219,14 +219,6 @@ class SparseOnlineGP(Host):
     # -- what is known --------------------------------------------------------------------------
 
     @property
-    def noise_variance(self) -> Float[Tensor, "*batch out"]:
-        """Observation noise variance, in the outputs' own squared units."""
-        noise = self.units.value(self.log_noise_variance.exp(), 2)
-        for part in self._parts:
-            noise = part.noise(noise)
-        return noise
-
-    @property
     def basis_inputs(self) -> Float[Tensor, "*batch slots in"]:
         """Basis points in the inputs' own units; only slots with ``posterior.active == 1`` count."""
         scale, shift = self.units.input.scale, self.units.input.shift
@@ -270,14 +262,8 @@ class SparseOnlineGP(Host):
     def project(self, x: Tensor, y: Tensor, on: Tensor | None) -> tuple[UpdateReport, Tensor, Tensor]:
         """Learn one sample per model where ``on`` is 1; the last three fields of a :class:`Sample`."""
         z, t = self.units.input(x), self.units.output(y)
-        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, self.weighing)
-
-    def count_sample(self, *, anew: bool = False) -> None:
-        """After a sample and all notes of it: rebuild the caches when it is time, or at once."""
-        n = self.n_samples + 1
-        vars(self)["n_samples"] = n  # an assignment to a Module takes ten times as long
-        if anew or self.is_due(n):
-            self.refresh()
+        weighing = [part for part in self._parts if type(part).weigh is not Part.weigh]
+        return absorb(self.posterior, z, t, self.kernel, self.shared_noise(), on, weighing)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Number of samples seen: the rhythm of rebuilds continues after a reload."""
@@ -291,3 +277,51 @@ def default_parts() -> list[Part]:
     """What bears outliers, slow and abrupt changes, holds its intervals, and learns kernel and noise."""
     wandering = ProcessNoise(0.001)
     return [RobustWeight(3.0), DetectChanges(), wandering, CalibrateNoise(), LearnHyperparameters()]
+
+
+def DeepKernelSOGP(  # noqa: N802  a kind of learner, called like the others
+    in_features: int,
+    out_features: int,
+    *,
+    hidden: Sequence[int] | None = None,
+    features: int | None = None,
+    seed: int = 0,
+    base: StationaryKernel | None = None,
+    parts: Iterable[nn.Module] | None = None,
+    **options: Any,
+) -> SparseOnlineGP:
+    """A SparseOnlineGP on ``[x / L, net(x)]``, network and kernel learned online in constant memory.
+
+    The basis is kept as inputs and embedded again whenever the network moves; the natural form does not
+    contain the kernel, so nothing else has to follow. See DeepKernel and LearnHyperparameters.
+
+    Thousands of weights want more than the last 32 samples, which on a trajectory are one place: 2000
+    samples of the past are kept to learn them from, and each rebuild takes two steps. Where g wanders
+    (``ProcessNoise``) the past is another g: one step, and no memory.
+
+    Args:
+        hidden, features: of the network; (64, 64) and 16, or (32, 32) and 6 without a memory.
+        seed: of its weights.
+        base: kernel on inputs and features, Matern 3/2 by default.
+        parts: as of SparseOnlineGP, by default ``[RobustWeight(3.0), DetectChanges(), CalibrateNoise()]``;
+            ``LearnHyperparameters`` is added if it is not among them.
+        options: see SparseOnlineGP (without ``kernel``).
+
+    Raises:
+        ParameterError: from SparseOnlineGP and DeepKernel.
+    """
+    calibrated = [RobustWeight(3.0), DetectChanges(), CalibrateNoise()]
+    own = calibrated if parts is None else copy_parts(parts)
+    learning = next((part for part in own if isinstance(part, LearnHyperparameters)), None)
+    if learning is None:
+        wanders = any(isinstance(part, ProcessNoise) for part in own)
+        learning = LearnHyperparameters() if wanders else LearnHyperparameters(steps=2, memory=2000)
+        own.append(learning)
+    fleet = fleet_options(options)
+    kernel = DeepKernel(
+        Matern32(in_features, **fleet) if base is None else base,
+        hidden=hidden if hidden is not None else (64, 64) if learning.memory else (32, 32),
+        features=features if features is not None else 16 if learning.memory else 6,
+        seed=seed,
+    )
+    return SparseOnlineGP(in_features, out_features, kernel=kernel, parts=own, **options)

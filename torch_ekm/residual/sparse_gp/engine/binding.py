@@ -13,10 +13,9 @@ import torch
 from torch import nn
 
 from ....typing import Tensor
-from ...kernels.action_linear import ActionLinearKernel
 from ...kernels.deep import DeepKernel
 from ...kernels.kernel import Kernel
-from ...kernels.linear import LinearKernel
+from ...kernels.linear import ActionLinearKernel, LinearKernel
 from ...kernels.stationary import Matern32, SquaredExponential
 from .. import plan as P
 from ..forgetting import ForgettingFactor, ProcessNoise
@@ -35,9 +34,6 @@ _KINDS = {SquaredExponential: 0, Matern32: 1}  # as numba_kernels has them
 
 class Engine:
     """Knows memory by address, so a copy of it begins anew."""
-
-    def __deepcopy__(self, memo: dict) -> Engine:
-        return type(self)()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), ()
@@ -136,7 +132,8 @@ class Plan(Bound):
         row[P.LAYERS], row[P.NETWORK] = len(layers), self.own(np.array(layers, np.int64))
         row[P.WIDTH] = row[P.IN] + (layers[-1][1] if layers else 0)
         row[P.VALUES] = row[P.IN] + sum(layer[1] for layer in layers)
-        row[P.EMBEDDED] = self.own(np.empty((len(self.all), row[P.SLOTS], row[P.WIDTH])))
+        for field, width in ((P.EMBEDDED, P.WIDTH), (P.LAYERED, P.VALUES)):
+            row[field] = self.own(np.empty((len(self.all), row[P.SLOTS], row[width])))
         return row
 
     def _fields(self, gp: Host) -> dict[int, Any]:
@@ -185,7 +182,7 @@ class Plan(Bound):
             moments = (learning.adam.get_buffer(f"{order}_{i}").data_ptr() for order in ("first", "second"))
             rows.append([p.data_ptr(), *moments, size, places[p.data_ptr()], is_logarithm(name) + noise])
         M, m, n = row[P.SLOTS], gp.out_features, at + gp.out_features
-        row[P.LEARNING] = self.own(np.array([learning.window, learning.replayed(gp), len(rows), n]))
+        row[P.LEARNING] = self.own(np.array([learning.window, learning.replayed(), len(rows), n]))
         row[P.PARAMETERS] = self.own(np.array(rows))
         row[P.SUMS] = self.own(np.empty((len(self.all), M * (2 * M + m + row[P.WIDTH]) + n + 3)))
         return row
@@ -213,8 +210,7 @@ class Plan(Bound):
             return False
         marks = [t._version for t in (self._basis, *self.parameters)]
         if marks != self._marks:
-            loops: Any = load_loops()
-            loops.embed_fleet(self.row)
+            load_loops().embed_fleet(self.row)
             self._marks = marks
         return True
 

@@ -46,9 +46,7 @@ class CompiledEngine(Engine):
         x, new = x.contiguous(), x.new_empty
         mean, v = new(plan.one), new(plan.one if variance else 0)
         J, dv = new(plan.two if slopes else 0), new(plan.two if slopes and variance else 0)
-        loops: Any = load_loops()
-        addresses = (t.data_ptr() for t in (x, mean, v, J, dv))
-        loops.query_fleet(plan.row, noisy, *addresses)
+        load_loops().query_fleet(plan.row, noisy, *(t.data_ptr() for t in (x, mean, v, J, dv)))
         return MomentsWithJacobians(mean, v, J, dv)
 
     def learn(self, gp: Host, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
@@ -60,8 +58,8 @@ class CompiledEngine(Engine):
         figures, event = np.zeros((4, len(on))), np.zeros(len(on), np.int64)
         if mask is not None:
             figures[2] = 1.0
-        loops: Any = load_loops()
-        alarm = loops.update_fleet(plan.row, gp.n_samples, on, x.data_ptr(), y.data_ptr(), figures, event)
+        at = x.data_ptr(), y.data_ptr()
+        alarm = load_loops().update_fleet(plan.row, gp.n_samples, on, *at, figures, event)
         if alarm < 0:
             return None
         plan.act(gp, bool(alarm))
@@ -77,8 +75,7 @@ class CompiledEngine(Engine):
         """The caches from the natural form; False: torch must do it."""
         plan = self._free(gp)
         if plan is not None:
-            loops: Any = load_loops()
-            loops.rebuild_fleet(plan.row, plan.share)
+            load_loops().rebuild_fleet(plan.row, plan.share)
         return plan is not None
 
     def descend(self, gp: Host, learning: LearnHyperparameters, n: int, end: float) -> bool:
@@ -90,11 +87,10 @@ class CompiledEngine(Engine):
         # the gradient of one kernel for all models is a sum
         if plan is None or not (plan.row[P.OWN] or len(plan.all) == 1):
             return False
-        loops: Any = load_loops()
-        step = n, learning.since
-        begin = plan.begun[1] if plan.begun[0] == step else 0.0
-        if begin == 0.0:
-            leads = learning.start(gp)
+        loops, step = load_loops(), (n, learning.since)
+        begin = plan.begun[1]
+        if plan.begun[0] != step:
+            begin, leads = 0.0, learning.start(gp)
             loops.embed_fleet(plan.past)
             if leads:
                 loops.rebuild_fleet(plan.past, 0.0)
@@ -112,12 +108,11 @@ class CompiledEngine(Engine):
         """x, y and mask of a block into the units, see ``Units.pool``; False: torch must do it."""
         if self._free(gp) is None:
             return False
-        loops: Any = load_loops()
         for scale, values in zip((gp.units.input, gp.units.output), block[:2], strict=True):
             sizes = gp.batch_shape.numel(), *values.shape[-2:], float(scale.memory)
             pooled = scale.shifted, scale.weight, scale.centre, scale.spread, scale.large
             tensors = values.contiguous(), block[2].contiguous(), *pooled
-            loops.pool_columns(*sizes, *(t.data_ptr() for t in tensors))
+            load_loops().pool_columns(*sizes, *(t.data_ptr() for t in tensors))
         return True
 
     def _free(self, gp: Host) -> Plan | None:

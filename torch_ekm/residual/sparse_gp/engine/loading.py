@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from ...._warnings import warn
 from ....exceptions import SpeedWarning
@@ -63,7 +64,7 @@ class Loader:
 _loader = Loader()
 
 
-def load_loops(*, wait: bool = False) -> ModuleType | None:
+def load_loops(*, wait: bool = False) -> Any:
     """See :meth:`Loader.load`."""
     return _loader.load(wait=wait)
 

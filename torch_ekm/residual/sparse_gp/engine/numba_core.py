@@ -23,9 +23,8 @@ from .numba_recursion import absorb, times
 def embed_fleet(p):
     """The bases as the kernels see them, after torch has changed them or the kernels."""
     d, M = p[P.IN], p[P.SLOTS]
-    values = np.empty((M, p[P.VALUES]))
     for b in range(p[P.MODELS]):
-        basis = matrix_at(p[P.BASIS], b, M, d)
+        basis, values = matrix_at(p[P.BASIS], b, M, d), matrix_at(p[P.LAYERED], b, M, p[P.VALUES])
         turn_weights(p, b * p[P.OWN])
         for i in range(M):
             for j in range(d):

@@ -1,7 +1,7 @@
 """A step on the lagged prequential loss as compiled loops.
 
 Equations and names are those of :class:`~torch_ekm.residual.LearnHyperparameters` and its
-:class:`~torch_ekm.residual.sparse_gp.prequential_loss.PrequentialLoss`, which torch differentiates itself.
+:class:`~torch_ekm.residual.sparse_gp.hyperparameters.PrequentialLoss`, which torch differentiates itself.
 Here, with ``E = Ck``, ``F = Qk`` and the loss' derivatives ``g`` by mean, variance ``v = k** + k'Ck``,
 ``p = u + k'Ck`` and u of each query::
 
@@ -24,7 +24,7 @@ from numba import njit, types
 from .. import plan as P
 from ..hyperparameters import BETAS, LEAST, LEAST_NOISE, MOST, NETWORK_DECAY, NETWORK_RATE
 from .numba_core import shared_noise
-from .numba_kernels import embed, kernel_rows, network, network_back
+from .numba_kernels import embed, kernel_rows, network_back
 from .numba_math import add_products, dot, transposed
 from .numba_memory import (
     A1,
@@ -288,20 +288,15 @@ def _step(p, b):
 @njit(types.void(I1), **COMMON)
 def step_fleet(p):
     """The rest of a step: the part of K in the gradient of each model, and Adam's move."""
-    d, m, M, W = p[P.IN], p[P.OUT], p[P.SLOTS], p[P.WIDTH]
-    values, k, psi, phi = np.empty((M, p[P.VALUES])), np.empty((M, M)), np.empty((M, M)), np.empty((M, M))
-    diagonal, jitter = np.empty(M), 1.0 + vector_at(p[P.FIGURES], 0, 3)[1]
+    m, M, W = p[P.OUT], p[P.SLOTS], p[P.WIDTH]
+    k, psi, phi, diagonal = np.empty((M, M)), np.empty((M, M)), np.empty((M, M)), np.empty(M)
+    jitter = 1.0 + vector_at(p[P.FIGURES], 0, 3)[1]
     for b in range(p[P.MODELS]):
         by_K, less, T, back, gradient, rest = _sums(p, b)
         if rest[2] == 0.0:
             continue
-        points, own = matrix_at(p[P.BASIS], b, M, d), b * p[P.OWN]
-        alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
-        basis = matrix_at(p[P.EMBEDDED], b, M, W)
-        for i in range(M):
-            for j in range(d):
-                values[i, j] = points[i, j]
-        network(p, own, values)
+        own, alpha = b * p[P.OWN], matrix_at(p[P.VECTORS], 2 * b, M, m)
+        basis, values = matrix_at(p[P.EMBEDDED], b, M, W), matrix_at(p[P.LAYERED], b, M, p[P.VALUES])
         kernel_rows(p, own, basis, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi, diagonal)
         by, by_diagonal, by_s2 = np.zeros((M, M)), np.empty(M), rest[0]
         for i in range(M):

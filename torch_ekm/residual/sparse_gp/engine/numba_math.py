@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import types
 
-from .numba_memory import A1, A2, INT, F, inner, made
+from .numba_memory import A1, A2, INT, F, inner
 
 _EXACT = {"contract"}  # sums in the order in which they stand
 _TO_INTEGER = 6755399441055744.0  # 1.5 * 2^52: its last bits are those of what was added
@@ -19,26 +19,6 @@ _MANTISSA, _ONE = 0xFFFFFFFFFFFFF, 0x3FF0000000000000  # bits of a double: the l
 # Taylor's series, the last term first: e^r up to r^13, artanh(s)/s without the 1 up to s^20
 _OF_EXP = tuple(1.0 / math.factorial(n) for n in range(13, -1, -1))
 _OF_LOG = tuple(1.0 / n for n in range(21, 2, -2))
-
-
-@made
-def _as_float(context, bits):
-    """The double of these bits."""
-
-    def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], context.get_value_type(types.float64))
-
-    return types.float64(types.int64), generate
-
-
-@made
-def _bits(context, value):
-    """The bits of a double."""
-
-    def generate(context, builder, signature, args):
-        return builder.bitcast(args[0], context.get_value_type(types.int64))
-
-    return types.int64(types.float64), generate
 
 
 @inner(F(F), fastmath=_EXACT)
@@ -50,15 +30,15 @@ def exp(x):
     p = 0.0
     for a in _OF_EXP:  # |r| <= ln(2)/2
         p = p * r + a
-    return p * _as_float((_bits(n) << 52) + _ONE)
+    return p * np.int64((np.float64(n).view(np.int64) << 52) + _ONE).view(np.float64)
 
 
 @inner(F(F), fastmath=_EXACT)
 def log(y):
     """ln y of a normal y > 0: ``y = 2^e m``, ``ln m = 2 artanh((m - 1)/(m + 1))``."""
-    bits = _bits(y)
-    e = _as_float((bits >> 52) | 0x4330000000000000) - 4503599627371519.0
-    m = _as_float((bits & _MANTISSA) | _ONE)
+    bits = np.float64(y).view(np.int64)
+    e = np.int64((bits >> 52) | 0x4330000000000000).view(np.float64) - 4503599627371519.0
+    m = np.int64((bits & _MANTISSA) | _ONE).view(np.float64)
     high = m > 1.4142135623730951
     m, e = (0.5 * m if high else m), (e + 1.0 if high else e)
     s = (m - 1.0) / (m + 1.0)
@@ -88,7 +68,7 @@ def add_products(A, B, a, out, lower, upper):
         lower: only what lies on and below the diagonal (and a little above).
         upper: A is an upper triangle.
     """
-    n, m, K, sums = A.shape[0], B.shape[0], A.shape[1], np.empty((2, 4))
+    n, m, K = A.shape[0], B.shape[0], A.shape[1]
     for i in range(0, n, 4):
         rows, end, k0 = min(4, n - i), min(m, i + 4) if lower else m, i if upper else 0
         a0, a1 = A[i, k0:], A[min(i + 1, n - 1), k0:]
@@ -105,11 +85,11 @@ def add_products(A, B, a, out, lower, upper):
                 t1 += a1[k] * c[k]
                 t2 += a2[k] * c[k]
                 t3 += a3[k] * c[k]
-            sums[0, 0], sums[0, 1], sums[0, 2], sums[0, 3] = s0, s1, s2, s3
-            sums[1, 0], sums[1, 1], sums[1, 2], sums[1, 3] = t0, t1, t2, t3
-            for r in range(rows):
-                for s in range(min(2, end - j)):
-                    out[i + r, j + s] += a * sums[s, r]
+            for r, (s, t) in enumerate(((s0, t0), (s1, t1), (s2, t2), (s3, t3))):
+                if r < rows:
+                    out[i + r, j] += a * s
+                    if j + 1 < end:
+                        out[i + r, j + 1] += a * t
 
 
 @inner(A2(A2))

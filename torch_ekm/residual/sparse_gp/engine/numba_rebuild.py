@@ -85,17 +85,14 @@ def _gram(p, b, embedded, active):
     return K
 
 
-@inner(types.void(A2, A2, A2, A2, F, F))
-def _wander(Lt, LW, precision, information, kept, s2):
+@inner(types.void(A2, A2, A2, A2, A2, F, F))
+def _wander(Lt, LW, LWL, precision, information, kept, s2):
     """See :class:`~torch_ekm.residual.ProcessNoise`; ``LW``: L'W, is overwritten."""
     M, m, lost = Lt.shape[0], information.shape[1], 1.0 - kept
-    R, h = np.zeros((M, M)), np.zeros((M, m))
-    add_products(Lt, LW, lost, R, True, True)  # W and so L'WL are symmetric
+    R, h = lost * LWL, np.zeros((M, m))
     for i in range(M):
         R[i, i] += 1.0
-        for k in range(i, M):
-            for o in range(m):
-                h[i, o] += Lt[i, k] * information[k, o]
+    add_products(Lt, transposed(information), 1.0, h, False, True)
     _factorise(R)
     _solve(R, LW, False)
     _solve(R, h, False)
@@ -104,13 +101,10 @@ def _wander(Lt, LW, precision, information, kept, s2):
     for i in range(M):
         for j in range(i + 1):
             precision[i, j] *= kept
-    _mirror(precision)
-    for i in range(M):
         for o in range(m):
-            total = 0.0
-            for k in range(M):
-                total += Gt[i, k] * h[k, o]
-            information[i, o] = math.sqrt(kept) * (information[i, o] - lost * total)
+            information[i, o] *= math.sqrt(kept)
+    _mirror(precision)
+    add_products(Gt, transposed(h), -lost * math.sqrt(kept), information, False, False)
 
 
 @njit(types.void(I1, F), **COMMON)
@@ -118,7 +112,8 @@ def rebuild_fleet(p, share):
     """alpha, C and Q of each model from its natural form; their bases are embedded.
 
     Args:
-        share: of ProcessNoise, by which the natural form changes first; 0: it does not.
+        share: of ProcessNoise, by which the natural form changes, too; 0: it does not. Mean and covariance
+            of g become ``sqrt(kept)`` and ``kept`` times theirs, but for the prior's, and so do their caches.
     """
     M, m, W = p[P.SLOTS], p[P.OUT], p[P.WIDTH]
     for b in range(p[P.MODELS]):
@@ -128,19 +123,15 @@ def rebuild_fleet(p, share):
         _factorise(L)
         Lt, A, LW = transposed(L), np.zeros((M, M)), np.zeros((M, M))
         add_products(Lt, moments[2], 1.0 / s2, LW, False, True)
-        if share > 0.0:
-            _wander(Lt, LW, moments[2], vectors[1], (1.0 - share) ** vector_at(p[P.PENDING], b, 1)[0], s2)
-            LW[:, :] = 0.0
-            add_products(Lt, moments[2], 1.0 / s2, LW, False, True)
         add_products(Lt, LW, 1.0, A, True, True)
         inverse, right = np.zeros((M, M)), np.zeros((M, m))
+        kept = (1.0 - share) ** vector_at(p[P.PENDING], b, 1)[0]
+        add_products(Lt, transposed(vectors[1]), math.sqrt(kept) / s2, right, False, True)
+        if share > 0.0:
+            _wander(Lt, LW, A, moments[2], vectors[1], kept, s2)
         for i in range(M):
             A[i, i] += 1.0
             inverse[i, i] = 1.0
-            for k in range(i, M):
-                a = Lt[i, k] / s2
-                for o in range(m):
-                    right[i, o] += a * vectors[1, k, o]
         _factorise(A)
         _solve(L, inverse, True)
         inverse_t, alpha, C, Q = transposed(inverse), vectors[0], moments[0], moments[1]
@@ -152,10 +143,8 @@ def rebuild_fleet(p, share):
         add_products(Gt, Gt, 1.0, C, True, True)
         for i in range(M):
             for j in range(i + 1):
-                C[i, j] -= Q[i, j]
+                C[i, j] = kept * (C[i, j] - Q[i, j])
                 Q[i, j] *= active[i] * active[j]
-            for k in range(i, M):
-                for o in range(m):
-                    alpha[i, o] += Gt[i, k] * right[k, o]
+        add_products(Gt, transposed(right), 1.0, alpha, False, True)
         _mirror(Q)
         _mirror(C)
