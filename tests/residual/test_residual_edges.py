@@ -195,6 +195,24 @@ def test_options_that_cannot_be_are_named(kind, options):
 
 
 @pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("engine", ["compiled", "torch"])
+@pytest.mark.parametrize("make", [default_learner, SparseOnlineGP, RecursiveLeastSquares])
+def test_a_query_with_a_nan_returns_nan(make, engine) -> None:
+    g = make(3, 2)
+    if engine == "torch":
+        for one in g.modules():
+            if hasattr(one, "engine"):
+                one.engine = None
+    x = torch.randn(30, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    g.update(x, x[:, :2])
+    query = torch.tensor([0.1, torch.nan, 0.3], dtype=torch.float64)
+    told = [g(query), g.predict(query).mean, g.linearize(query)[0], g(torch.stack([x[0], query]))[1]]
+    told += [g.predict(query, observation=True).mean]
+    assert all(bool(mean.isnan().all()) for mean in told)
+    assert bool(g(x[0]).isfinite().all())
+
+
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("make", [lambda: default_learner(3, 2), lambda: RecursiveLeastSquares(3, 2)])
 def test_what_is_no_real_number_is_named(make):
     learner, x, y = make(), torch.zeros(3), torch.zeros(2)

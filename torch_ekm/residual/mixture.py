@@ -208,7 +208,7 @@ class MixtureResidual(ResidualLearner):
         if found is not None:
             return found.mean
         x = self.check_query(x)
-        return self._mean(*self._stacked((learner(x),) for learner in self.members))
+        return _only_of(x, self._mean(*self._stacked((learner(x),) for learner in self.members)))
 
     def predict(self, x: Tensor, *, observation: bool = False) -> Normal:
         """Moments of the mixture, or mean and running variance of y with ``observation=True``."""
@@ -224,7 +224,7 @@ class MixtureResidual(ResidualLearner):
         variances = self._stacked(one.moments(x) for one in self.members)[1]
         variance = self._spread(self._wide(variances), self._apart(means, mean))
         # y is measured: experts that disagree by more than y scatters do not know less of g than of y
-        return Normal(mean, torch.minimum(variance.sqrt(), deviation), validate_args=False)
+        return Normal(_only_of(x, mean), torch.minimum(variance.sqrt(), deviation), validate_args=False)
 
     def predictive(self, x: Tensor) -> ScaleMixtureLaw:
         """Mixture of Student t laws about the mean: what log densities should be taken of."""
@@ -248,7 +248,8 @@ class MixtureResidual(ResidualLearner):
             return found.mean, found.jacobian
         x = self.check_query(x)
         means, slopes = map(finite, self._stacked(learner.linearize(x) for learner in self.members))
-        return self.bounded_slope(self._sum(means), (self.gain.unsqueeze(-2) * slopes).sum(-1))
+        mean, slope = self.bounded_slope(self._sum(means), (self.gain.unsqueeze(-2) * slopes).sum(-1))
+        return _only_of(x, mean), slope
 
     def slope_deviation(self, x: Tensor) -> Tensor:
         """``var = sum_e p_e (h_e^2 var_b + (h_e J_b - J)^2)``, within the experts' slopes and between."""
@@ -287,7 +288,7 @@ class MixtureResidual(ResidualLearner):
         most = local * (share * self._wide(noisy)).sum(-1)
         steepest = local.unsqueeze(-1) * (share.unsqueeze(-2) * dv).sum(-1) + 2.0 * most.unsqueeze(-1) * by_x
         return MomentsWithJacobians(
-            mean,
+            _only_of(x, mean),
             torch.minimum(variance, most),
             jacobian,
             torch.where((variance <= most).unsqueeze(-1), slope, steepest),
@@ -351,7 +352,7 @@ class MixtureResidual(ResidualLearner):
             return found.mean, found.standard
         x = self.check_query(x)
         mean, deviation, _ = self._together([one.moments(x, observation=True) for one in self.members])
-        return mean, deviation * self.noise.log_factor(x).exp().to(deviation)
+        return _only_of(x, mean), deviation * self.noise.log_factor(x).exp().to(deviation)
 
     def _together(self, moments: Sequence[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor, Tensor]:
         """Mean of all, deviation of y as the learners state it, and their means."""
@@ -448,6 +449,11 @@ def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
     if len(set(shapes)) > 1:
         raise ParameterError("learners", shapes, "of the same (in_features, out_features, batch_shape)")
     return members[0]
+
+
+def _only_of(x: Tensor, mean: Tensor) -> Tensor:
+    """A mean, NaN where an input is: there no learner is finite, and the model alone is no answer."""
+    return mean.where(~x.isnan().any(-1, keepdim=True), torch.nan)
 
 
 def finite(values: Tensor) -> Tensor:
