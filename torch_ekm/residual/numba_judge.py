@@ -163,7 +163,7 @@ def _settle(g, o, n_learners, p, carried):
 
 @inner(F(I1, INT, A1))
 def mean_of(g, o, means):
-    """The mixture's, cut at twice the largest y."""
+    """The mixture's, not yet cut at twice the largest y."""
     mean, gain = vector_at(g[P.OFFSET], o, 1)[0], vector_at(g[P.GAIN], o, means.shape[0])
     for i in range(means.shape[0]):
         mean += gain[i] * means[i]
@@ -182,7 +182,7 @@ def scatter_of(g, o, noisy):
 
 @inner(types.void(I1, INT, A1, A1))
 def make_finite(g, o, means, variances):
-    """See ``_finite`` and ``_wide`` of the mixture."""
+    """See ``finite`` and ``_wide`` of the mixture."""
     most = vector_at(g[P.LARGEST], o, 1)[0]
     for i in range(means.shape[0]):
         means[i] = means[i] if math.isfinite(means[i]) else 0.0
