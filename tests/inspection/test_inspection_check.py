@@ -76,7 +76,7 @@ FAULTS = {  # what is changed (0: URDF, 1: transmission file); name, state and t
     "late": (1, SPRING + "0", SPRING + "100", "tendon 'left'", "warning", "from 100 deg"),
     "one pad": (1, '[[pads]]\nname = "left"', '[[pads]]\nname = "left"', OPPOSED, "error", "two"),
     "unreadable": (0, "<robot", "<robot <", "hand's files", "error", "not well-formed XML"),
-    "rigid": (1, "stiffness = 10.0", "", "actuators", "ok", "left 100"),
+    "rigid": (1, "stiffness = 10.0", "", "actuators", "warning", "left 100"),
 }  # fmt: skip
 
 

@@ -239,6 +239,7 @@ class Reduction(nn.Module):
             pose = planar_pose_basis(torch.tensor(hand.planar_normal, dtype=dtype))
         self.joint_basis = nn.Buffer(joint, persistent=False)
         self.pose_basis = nn.Buffer(pose, persistent=False)
+        self.basis = nn.Buffer(torch.block_diag(joint, pose), persistent=False)
         pose_scaled = pose.clone()
         pose_scaled[:3] *= CHARACTERISTIC_LENGTH
         self.scaled_basis = nn.Buffer(torch.block_diag(joint, pose_scaled), persistent=False)
