@@ -121,7 +121,7 @@ class Ends:
 
     def over(self, seen: Observation, looks: int, stopped: bool, declines: bool) -> Stop | None:
         """Why the manipulation ends before the next movement; None: it goes on. ``seen`` is the mean of
-        ``looks`` readings; ``stopped``: somebody has asked for it; ``declines``: what is out of reach."""
+        ``looks`` readings; ``stopped``: an end was asked for; ``declines``: what is out of reach."""
         held, focus, rule = seen.status is PlantStatus.HELD, self._controller.focus, self.rule
         if seen.status is PlantStatus.LOST:
             return Stop(StopReason.OBJECT_LOST, seen)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable
 
 import torch
 
@@ -147,9 +147,7 @@ class ModelHand:
                 self.failure = GraspEndsError(str(lin.doubts[0]))
             self._motion = ContactMotion(self.kinematic, lin)
             self._linearization = self._motion.answered(lin)
-            self._bears = self._of_pads(
-                dict(zip(lin.contacts.finger, lin.forces.normal.tolist(), strict=True))
-            )
+            self._bears = self._of_pads(lin.contacts.finger, lin.forces.normal.tolist())
         except GraspError as error:
             self.failure = error
 
@@ -158,7 +156,7 @@ class ModelHand:
         force = self.force if self._measured else None
         contacts = self.kinematic.touching(self.state, force)
         lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
-        self._spare = self._of_pads(dict(zip(lin.contacts.finger, lin.forces.margin.tolist(), strict=True)))
+        self._spare = self._of_pads(lin.contacts.finger, lin.forces.margin.tolist())
         self._is_stale = False
         return lin
 
@@ -177,7 +175,7 @@ class ModelHand:
         self.increment = motion.state.minus(self.state)
         self.correction = torch.zeros_like(self.increment) if correction is None else correction
         self.state, self.a = motion.state, self.a + w
-        bears = self._of_pads(step.normal)
+        bears = self._of_pads(step.normal, step.normal.values())
         before, self.said, self._bears = self.force, bears - self._bears, bears
         self._is_stale = True
         self.force = bears
@@ -205,6 +203,7 @@ class ModelHand:
         _, _, after, step = self._tried
         return copy.copy(after), step
 
-    def _of_pads(self, normal: Mapping[str, float]) -> Tensor:
-        """Of each pad of the hand, 0 of one that does not touch [N]."""
-        return self.a.new_tensor([normal.get(pad.name, 0.0) for pad in self.hand.pads])
+    def _of_pads(self, names: Iterable[str], values: Iterable[float]) -> Tensor:
+        """What contacts with these names bear, of each pad of the hand; 0 of one that does not touch [N]."""
+        found = dict(zip(names, values, strict=True))
+        return self.a.new_tensor([found.get(pad.name, 0.0) for pad in self.hand.pads])

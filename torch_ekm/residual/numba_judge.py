@@ -180,13 +180,15 @@ def scatter_of(g, o, noisy):
     return variance
 
 
-@inner(types.void(I1, INT, A1, A1))
+@inner(types.boolean(I1, INT, A1, A1))
 def make_finite(g, o, means, variances):
-    """See ``finite`` and ``_wide`` of the mixture."""
-    most = vector_at(g[P.LARGEST], o, 1)[0]
+    """See ``finite`` and ``_wide`` of the mixture; whether any mean was finite."""
+    most, known = vector_at(g[P.LARGEST], o, 1)[0], False
     for i in range(means.shape[0]):
+        known |= math.isfinite(means[i])
         means[i] = means[i] if math.isfinite(means[i]) else 0.0
         variances[i] = variances[i] if math.isfinite(variances[i]) else most * most
+    return known
 
 
 @inner(F(I1, INT, F, types.boolean, F, A1, A1, A1, A1, A1, A2))

@@ -147,10 +147,8 @@ def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, stan
             by_x[o] = share if abs(f) < L.REACH else 0.0
             log_factor[o] = share * min(max(f, -L.REACH), L.REACH)
         for o in range(m):
-            r, known = b * m + o, False
-            for i in range(n):
-                known |= math.isfinite(means[o, i])
-            make_finite(g, r, means[o], latent[o])
+            r = b * m + o
+            known = make_finite(g, r, means[o], latent[o])
             make_finite(g, r, means[o], noisy[o])
             free, most = mean_of(g, r, means[o]), FARTHEST_MEAN * vector_at(g[P.LARGEST], r, 1)[0]
             value = min(max(free, -most), most)
