@@ -161,9 +161,16 @@ def test_compiled_units_are_those_of_torch(shape):
         x = (x * 1e3 if k == 3 else x) * x.new_tensor([1.0, 0.0 if k == 2 else 1e-6, 1e150, 1.0])
         x[..., 7 : 9 + k, :] *= 100.0
         on = (torch.rand(*shape, 32, generator=generator) < 0.9).double()
+        first = 32 * k + 5  # of a ring, whose end lies within the block
+        for i in range(32):
+            gp.recent.keep(first + i, x[..., i, :], x[..., i, :M], on[..., i])
         assert gp.engine is not None
-        assert gp.engine.pool(gp, x, x[..., :M], on)
+        assert gp.engine.pool(gp, first + 32, 32)
         other.units.pool(x, x[..., :M], on)
+        changes = gp.engine.settle(gp), (other.units.input.settle(), other.units.output.settle())
+        for found, wanted in zip(*changes, strict=True):
+            assert (found is None) == (wanted is None)
+            torch.testing.assert_close(found, wanted, atol=1e-15, rtol=1e-7)
     for a, b in zip(gp.units.buffers(), other.units.buffers(), strict=True):
         torch.testing.assert_close(a, b, atol=1e-15, rtol=1e-7)
 

@@ -24,6 +24,7 @@ from .sparse_gp.engine.numba_descent import step_fleet as step_fleet
 from .sparse_gp.engine.numba_memory import A2, A3, COMMON, I1, I2, INT, ON, inner, matrix_at, vector_at
 from .sparse_gp.engine.numba_rebuild import rebuild_fleet as rebuild_fleet
 from .sparse_gp.engine.numba_units import pool_columns as pool_columns
+from .sparse_gp.engine.numba_units import settle_columns as settle_columns
 
 embed_fleet, query_fleet, update_fleet = gp.embed_fleet, gp.query_fleet, gp.update_fleet
 

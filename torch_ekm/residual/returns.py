@@ -15,7 +15,10 @@ from .sparse_gp.part import Host
 from .tails import FREEDOM
 
 _KEPT = 2  # regimes
-_EVERY = 64  # samples between two copies of the present state
+_EVERY, _AT = (
+    64,
+    20,
+)  # samples between two copies of the present state, and the first: little else is due then
 _REST = 32  # samples after a change or a return in which there is neither a copy nor a return
 _CALM = -0.5, 0.12  # level of DetectChanges at which a copy is of one regime alone
 _MEMORY, _ENOUGH, _MOST = 0.9, 8.0, 10.0  # of log evidence: forgotten, that a regime is back, of one sample
@@ -61,7 +64,7 @@ class Returns(nn.Module):
         changed = level == COOL  # at the last sample: the learner has started again
         known, evidence, rest = self.known, self.known["evidence"], max(self.known["rest"] - 1, 0)
         known["n"], known["rest"] = known["n"] + 1, rest
-        due = known["n"] % _EVERY == 0
+        due = known["n"] % _EVERY == _AT
         if not (changed or evidence or due):
             return False
         states = self.states
@@ -101,8 +104,9 @@ def _cost(y: AnyArray, mean: AnyArray, deviation: AnyArray) -> float:
 @torch.no_grad()
 def copy_state(to: nn.Module, of: nn.Module) -> None:
     """All that a learner has learned, into another one of its make."""
-    for new, old in zip(to.buffers(), of.buffers(), strict=True):
+    for new, old in zip(vars(to)["_buffers"].values(), vars(of)["_buffers"].values(), strict=True):
         new.copy_(old)
-    for new, old in zip(to.modules(), of.modules(), strict=True):
-        if type(old).get_extra_state is not nn.Module.get_extra_state:
-            new.set_extra_state(old.get_extra_state())
+    if type(of).get_extra_state is not nn.Module.get_extra_state:
+        to.set_extra_state(of.get_extra_state())
+    for new, old in zip(vars(to)["_modules"].values(), vars(of)["_modules"].values(), strict=True):
+        copy_state(new, old)

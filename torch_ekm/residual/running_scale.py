@@ -21,6 +21,7 @@ COMPANY = 0.5  # of what chance would leave alone
 DOUBT = 2.0  # so many large ones are taken to be alone beforehand
 REST = 0.1, 0.05  # a block that varies less than this share of all before has this weight: it stands still
 REACH = 10.0  #: scales beyond which z goes no further, in columns where that matters
+SETTLED = 0.1  #: relative change of a scale (of a shift in units of it) that is not worth new units
 ALIEN = 1e-20  #: a variation below this share is no rest either: what was before was wrong
 
 
@@ -104,14 +105,14 @@ class RunningScale(nn.Module):
         for buffer, found in zip(pooled, _pooled(self, block, on), strict=True):
             buffer.copy_(found)
 
-    def settle(self, *young: Tensor, settled: float = 0.1) -> tuple[Tensor, Tensor] | None:
+    def settle(self, *young: Tensor, settled: float = SETTLED) -> tuple[Tensor, Tensor] | None:
         """Adopt what was found; returns the change as ``(offset, ratio)``: new z = (old z + offset) * ratio.
 
         None: no change is worth it.
 
         Args:
             young: a block as of :meth:`pool` that counts, too; every change is worth new units then.
-            settled: relative change of a scale (of a shift in units of it) that is not worth new units.
+            settled: as SETTLED.
         """
         found = _pooled(self, *young)[:3] if young else (self.weight, self.centre, self.spread)
         now: Any = *found, self.scale, self.shift, self.least

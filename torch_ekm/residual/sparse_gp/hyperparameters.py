@@ -78,8 +78,8 @@ class PrequentialLoss(nn.Module):
 
     def snapshot(self, posterior: SparsePosterior) -> None:
         """The present state becomes the past one."""
-        for old, new in zip(self.state.buffers(), posterior.buffers(), strict=True):
-            old.copy_(new)
+        for old, new in zip(self.state._buffers.values(), posterior._buffers.values(), strict=True):
+            old.copy_(new)  # .buffers() takes longer than to copy them
 
     def forward(self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, anew: bool = False) -> Tensor:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], for autograd to go through.
@@ -197,7 +197,7 @@ class LearnHyperparameters(Part):
                 if (end or self._leads) and self._is_due(learner, n + ahead):
                     learner.engine.descend(learner, self, n + ahead, end)
         if self._leads and learner.is_due(n):
-            for p, ahead in zip(self.theta(learner).values(), self.ahead().values(), strict=True):
+            for ahead, p in self.pairs(learner):
                 p.copy_(ahead)
             self._leads = False
 
@@ -215,7 +215,7 @@ class LearnHyperparameters(Part):
         self._begin(learner.n_samples, self._leads and units is not None and units.is_rough(learner))
 
     def _begin(self, n_rebuilt: int, leads: bool = False) -> None:
-        self.since, self._leads = (n_rebuilt, self.since[1] + 1), leads
+        vars(self).update(since=(n_rebuilt, self.since[1] + 1), _leads=leads)  # see count_sample
 
     def forget(self, models: Bool[Tensor, "*batch"]) -> None:
         """These models face another system: the state of the old one does not count."""
@@ -262,10 +262,15 @@ class LearnHyperparameters(Part):
         """Where steps lead to, by name."""
         return {**self.kernel.hyperparameters(), "log_noise": self.log_noise}
 
+    def pairs(self, learner: Host) -> list[tuple[Tensor, Tensor]]:
+        """Both, of each parameter."""
+        known = None if learner.engine is None else learner.engine.pairs(learner)
+        return known or list(zip(self.ahead().values(), self.theta(learner).values(), strict=True))
+
     def start(self, learner: Host) -> bool:
         """Before a step: it starts where the last ones lead. Whether they lead away from the caches."""
         if not self._leads:
-            for ahead, p in zip(self.ahead().values(), self.theta(learner).values(), strict=True):
+            for ahead, p in self.pairs(learner):
                 ahead.copy_(p)
         return self._leads
 

@@ -101,13 +101,13 @@ class Standardize(Part):
         n, offset = learner.n_samples + 1, (learner.refresh_offset - _AHEAD) % BLOCK
         if n == BLOCK or (n > BLOCK and (n - offset) % BLOCK == 0):
             size = offset if offset and n == BLOCK + offset else BLOCK
-            block = learner.recent.last(n, size)[:3]
-            if learner.engine is None or not learner.engine.pool(learner, *block):
-                learner.units.pool(*block)
+            if learner.engine is None or not learner.engine.pool(learner, n, size):
+                learner.units.pool(*learner.recent.last(n, size)[:3])
 
     def _adopt(self, learner: Host, *young: Tensor) -> None:
         posterior, units = learner.posterior, learner.units
-        change, change_t = units.input.settle(*young[::2]), units.output.settle(*young[1:])
+        found = None if young or learner.engine is None else learner.engine.settle(learner)
+        change, change_t = found or (units.input.settle(*young[::2]), units.output.settle(*young[1:]))
         alien = [ratio > 1.0 / ALIEN for _, ratio in filter(None, (change, change_t))]
         models = torch.cat(alien, dim=-1).any(-1) if alien else None
         if models is not None and (models.is_cuda or bool(models.any())):  # it would stay for good

@@ -101,6 +101,11 @@ class Plan(Bound):
         self.all = np.ones(math.prod(self.shape), np.bool_)
         fields, learned = self._fields(gp), () if self.learning is None else self.learning.buffers()
         self.parameters = tuple(gp.kernel.hyperparameters().values())
+        #: see LearnHyperparameters
+        self.pairs = []
+        if self.learning is not None:
+            theta = (*self.parameters, gp.log_noise_variance)
+            self.pairs = list(zip(self.learning.ahead().values(), theta, strict=True))
         tensors = [value for value in fields.values() if isinstance(value, Tensor)]
         tensors += [*gp.units.buffers(), *learned, *self.parameters]
         used = set(map(id, tensors))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from ...._warnings import warn
 from ....exceptions import SpeedWarning
 from ....typing import Tensor
 from ...report import MomentsWithJacobians, UpdateReport
+from ...running_scale import SETTLED, RunningScale
 from .. import plan as P
 from ..hyperparameters import PARTS, LearnHyperparameters
 from ..part import Host
@@ -104,16 +106,25 @@ class CompiledEngine(Engine):
         plan.begun = step, end
         return True
 
-    def pool(self, gp: Host, *block: Tensor) -> bool:
-        """x, y and mask of a block into the units, see ``Units.pool``; False: torch must do it."""
+    def pairs(self, gp: Host) -> list[tuple[Tensor, Tensor]]:
+        """See LearnHyperparameters; empty: torch must find them."""
+        plan = self._free(gp)
+        return [] if plan is None else plan.pairs
+
+    def pool(self, gp: Host, n: int, size: int) -> bool:
+        """The last ``size`` of n samples into the units, see ``Units.pool``; False: torch must do it."""
         if self._free(gp) is None:
             return False
-        for scale, values in zip((gp.units.input, gp.units.output), block[:2], strict=True):
-            sizes = gp.batch_shape.numel(), *values.shape[-2:], float(scale.memory)
+        recent, models = gp.recent, gp.batch_shape.numel()
+        for scale, values in ((gp.units.input, recent.x), (gp.units.output, recent.y)):
+            sizes = models, n - size, size, recent.capacity, values.shape[-1], float(scale.memory)
             pooled = scale.shifted, scale.weight, scale.centre, scale.spread, scale.large
-            tensors = values.contiguous(), block[2].contiguous(), *pooled
-            load_loops().pool_columns(*sizes, *(t.data_ptr() for t in tensors))
+            load_loops().pool_columns(*sizes, *(t.data_ptr() for t in (values, recent.on, *pooled)))
         return True
+
+    def settle(self, gp: Host) -> list[tuple[Tensor, Tensor] | None] | None:
+        """Changes of the units of x and y, see ``RunningScale.settle``; None: torch must find them."""
+        return None if self._free(gp) is None else [_settled(gp.units.input), _settled(gp.units.output)]
 
     def _free(self, gp: Host) -> Plan | None:
         return None if torch.compiler.is_compiling() else self.of(gp)
@@ -139,6 +150,16 @@ class CompiledEngine(Engine):
                 warn(_LEFT.format(type(gp).__name__, plan.reason), SpeedWarning)
             return None
         return plan if plan.follows() else None
+
+
+def _settled(scale: RunningScale) -> tuple[Tensor, Tensor] | None:
+    *shape, columns = scale.scale.shape
+    change, models = np.empty((2, scale.scale.numel())), math.prod(shape)
+    found = scale.weight, scale.centre, scale.spread, scale.least, scale.scale, scale.shift
+    if not load_loops().settle_columns(models, columns, SETTLED, change, *(t.data_ptr() for t in found)):
+        return None
+    offset, ratio = torch.from_numpy(change).view(2, *scale.scale.shape)
+    return offset, ratio
 
 
 def is_plain_one(x: Any, shape: tuple[int, ...]) -> bool:

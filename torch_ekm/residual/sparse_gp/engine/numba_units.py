@@ -1,4 +1,4 @@
-"""A block of samples pooled into the units of its columns as a compiled loop, see :class:`RunningScale`."""
+"""The units of columns as compiled loops: pooled from a block, adopted; see :class:`RunningScale`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit, types
 
 from ...running_scale import ALIEN, BLOCK, BURST_CLIP, CLIP, COMPANY, DOUBT, REST, SPIKES, TRIMMED
-from .numba_memory import A1, COMMON, INT, TINY, F, inner, matrix_at, vector_at
+from .numba_memory import A1, A2, COMMON, EPS, INT, TINY, F, inner, matrix_at, vector_at
 
 
 @inner(F(A1, F))
@@ -20,22 +20,26 @@ def _trimmed(squares, part):
     return math.sqrt(total / max(kept, 1))
 
 
-@njit(types.void(INT, INT, INT, F, INT, INT, INT, INT, INT, INT, INT), **COMMON)
-def pool_columns(models, n, columns, memory, block, on, shifted, weights, centres, spreads, large):
-    """The pooled figures of each model's columns take a block ``(n, columns)`` in; all given by addresses."""
-    x, away = np.empty(n), np.empty(n)
+@njit(types.void(INT, INT, INT, INT, INT, F, INT, INT, INT, INT, INT, INT, INT), **COMMON)
+def pool_columns(models, first, n, kept, columns, memory, of, on, shifted, weights, centres, spreads, large):
+    """The pooled figures of each model's columns take n samples in; all given by addresses.
+
+    ``of``, ``on``: ring of the last ``kept`` samples ``(kept, columns)``; the first one has number ``first``.
+    """
+    x, away, values, here = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
     for column in range(models * columns):
         b, c = column // columns, column % columns
-        rows, here, counts = matrix_at(block, b, n, columns), vector_at(on, b, n), vector_at(large, column, 2)
-        shift, size = vector_at(shifted, 0, columns)[c], 0
+        counts, shift, size = vector_at(large, column, 2), vector_at(shifted, 0, columns)[c], 0
         for i in range(n):
+            place = (first + i) % kept
+            values[i], here[i] = matrix_at(of, b, kept, columns)[place, c], vector_at(on, b, kept)[place]
             if here[i] > 0.0:
-                x[size] = rows[i, c]
+                x[size] = values[i]
                 size += 1
         order, count, most = np.sort(x[:size]), float(size), TINY
         middle = order[(size - 1) // 2] if shift * count > 0 else 0.0
         for i in range(n):
-            away[i] = rows[i, c] - middle if here[i] > 0.0 else 0.0
+            away[i] = values[i] - middle if here[i] > 0.0 else 0.0
             most = max(most, abs(away[i]))
         for i in range(n):
             away[i] /= most
@@ -73,3 +77,22 @@ def pool_columns(models, n, columns, memory, block, on, shifted, weights, centre
         inside = (1.0 - part) * math.sqrt(past / largest) + part * math.sqrt(new / largest)
         spread[0] = largest * math.sqrt(inside**4 + (1.0 - part) * part * (gap / largest) ** 2)
         centre[0] += part * gap
+
+
+@njit(types.boolean(INT, INT, F, A2, INT, INT, INT, INT, INT, INT), **COMMON)
+def settle_columns(models, columns, settled, change, weights, centres, spreads, least, scales, shifts):
+    """New scales and shifts, the change into ``change``: offset and ratio; returns whether there is one."""
+    least_of, any_ = vector_at(least, 0, columns), False
+    for column in range(models * columns):
+        centre, spread = vector_at(centres, column, 1)[0], vector_at(spreads, column, 1)[0]
+        scale_of, shift_of = vector_at(scales, column, 1), vector_at(shifts, column, 1)
+        scale, shift, lowest = scale_of[0], shift_of[0], least_of[column % columns]
+        new = lowest if lowest > 0.0 else 1.0
+        if spread > 100.0 * EPS * abs(centre) and spread > TINY:
+            new = max(spread, lowest)
+        off = max(new / scale, scale / new) - 1.0 + abs(centre - shift) / min(new, scale)
+        change[0, column], change[1, column] = 0.0, 1.0
+        if vector_at(weights, column, 1)[0] > 0.0 and off > settled:
+            change[0, column], change[1, column] = (shift - centre) / scale, scale / new
+            scale_of[0], shift_of[0], any_ = new, centre, True
+    return any_
