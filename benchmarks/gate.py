@@ -292,7 +292,7 @@ def part(seed: int, readings: int) -> Count:
     return count
 
 
-def search(readings: int, each: int = 500, seed: int = 0) -> Count:
+def search(readings: int, each: int = 500, seed: int = 1000) -> Count:
     """Sessions of ``each`` readings until there were so many; E-KM and KM+S in turn."""
     seeds, count = range(seed, seed + -(-readings // each)), Count()
     with concurrent.futures.ProcessPoolExecutor(min(os.cpu_count() or 1, len(seeds))) as pool:
@@ -305,9 +305,8 @@ def search(readings: int, each: int = 500, seed: int = 0) -> Count:
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     arguments.add_argument("--readings", type=int, default=100_000)
-    arguments.add_argument("--seed", type=int, default=1000, help="of the first session")
     options = arguments.parse_args()
-    count = search(options.readings, seed=options.seed)
+    count = search(options.readings)
     print(f"turns ended {', '.join(f'{n} {reason}' for reason, n in count.reasons.most_common())}")
     print(f"largest command {count.largest / DEG:.2f} deg, set-points beyond the range {count.outside}")
     print(count)

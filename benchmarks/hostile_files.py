@@ -554,11 +554,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--files", type=int, default=600)
-    parser.add_argument("--seed", type=int, default=1000)
     options = parser.parse_args()
     reader, counts, worst = Reader(), Counter(), Counter()
     with tempfile.TemporaryDirectory() as folder:
-        for kind, what, path in hostile(Path(folder), options.files, options.seed):
+        for kind, what, path in hostile(Path(folder), options.files, seed=1000):
             found = reader(kind, path)
             name = found.what if found.what in ("read", "refused") else "untyped"
             slow, large = found.seconds > SLOWEST, found.memory > LARGEST

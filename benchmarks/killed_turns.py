@@ -26,7 +26,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -57,7 +56,7 @@ sys.path.insert(0, str(Path(__file__).parent / "buses"))
 from far_end import BUSES, HAND, OBJECT, opened
 
 HERE = ("light", "sapien", "mujoco")  # in this process
-HANDS = (*HERE, *(bus.kind for bus in BUSES))
+HANDS = (*HERE, "dynamixel")
 RIGHT = ("reached", "reached, before it was killed", "ResumeError")
 _STANDS = 0.02  # [rad] that two readings of a hand at rest may differ
 
@@ -162,8 +161,6 @@ class Held:
     """In a new one, whose number it gives."""
     settle: Callable[[], None] = lambda: None
     """Waits until what was under way has ended."""
-    apart: Callable[[Callable[[], Any]], Any] = lambda work: work()
-    """Does what drives the hand, and gives what it returns."""
 
     def target(self, seen: Observation) -> PoseTarget:
         return PoseTarget.turned(seen.state, self.axis, degrees=self.degrees)
@@ -200,9 +197,9 @@ def here(kind: str) -> Iterator[Held]:
 
 
 @contextmanager
-def behind(kind: str) -> Iterator[Held]:
+def behind() -> Iterator[Held]:
     """A simulated hand behind an emulated bus."""
-    bus = next(one for one in BUSES if one.kind == kind)
+    bus = BUSES[0]
     with tempfile.TemporaryDirectory() as folder, opened(bus, Path(folder), "hand") as (end, path):
         model = KinematicModel(SimulatedHand(HAND, OBJECT).hand, load_object(OBJECT))
 
@@ -211,13 +208,10 @@ def behind(kind: str) -> Iterator[Held]:
             with bus.driver(path) as driver:
                 yield WithPose(driver, end, lost=end.lost)
 
-        def grasped() -> Observation:
-            with driven() as plant:
-                return plant.reset(1000)
-
         def grip() -> Observation:
             end.ask("reset 1000")
-            return in_child(grasped)
+            with driven() as plant:
+                return plant.reset(1000)
 
         def begun(drive: Callable[[Plant], None]) -> int:
             def child() -> None:
@@ -227,7 +221,7 @@ def behind(kind: str) -> Iterator[Held]:
             return forked(child)
 
         axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-        yield Held(model, axis, 8.0, grip, driven, begun, end.resume, in_child)
+        yield Held(model, axis, 8.0, grip, driven, begun, end.resume)
 
 
 def forked(work: Callable[[], object]) -> int:
@@ -237,29 +231,6 @@ def forked(work: Callable[[], object]) -> int:
             work()
         os._exit(0)
     return child
-
-
-def in_child(work: Callable[[], Any]) -> Any:
-    """What it returns or raises in a process of its own: one that has driven a hand of ROS 2 has threads, and
-    a copy of it stands still."""
-    near, far = multiprocessing.Pipe()
-
-    def child() -> None:
-        try:
-            done = True, work()
-        except Exception as error:
-            done = False, error
-        far.send_bytes(pickle.dumps(done))
-
-    number = forked(child)
-    far.close()
-    try:
-        well, result = pickle.loads(near.recv_bytes())
-    finally:
-        os.waitpid(number, 0)
-    if not well:
-        raise result
-    return result
 
 
 def killed(held: Held, share: float, learns: bool, folder: Path, longest: float) -> tuple[int, str]:
@@ -282,7 +253,7 @@ def killed(held: Held, share: float, learns: bool, folder: Path, longest: float)
     written = journal._read()
     if not journal.cut_short:
         return written.motions, f"{written.reason}, before it was killed"
-    return written.motions, held.apart(lambda: resumed(held, journal, written, seen, learns))
+    return written.motions, resumed(held, journal, written, seen, learns)
 
 
 def resumed(held: Held, journal: Journal, written: _Turn, seen: Observation, learns: bool) -> str:
@@ -316,11 +287,11 @@ def whole(held: Held, seen: Observation) -> float:
         return time.monotonic() - began
 
 
-def kills(kind: str, n: int, seed: int = 0) -> Counter[str]:
+def kills(kind: str, n: int, seed: int = 1000) -> Counter[str]:
     """What came of ``n`` turns of a hand that were killed at random moments."""
     draw, ends = np.random.default_rng(seed), Counter[str]()
-    with here(kind) if kind in HERE else behind(kind) as held:
-        longest = held.apart(partial(whole, held, held.grip()))
+    with here(kind) if kind in HERE else behind() as held:
+        longest = whole(held, held.grip())
         for k in range(n):
             moment = draw.uniform(0.0, 1.0)
             with tempfile.TemporaryDirectory() as folder:
@@ -335,16 +306,14 @@ def kills(kind: str, n: int, seed: int = 0) -> Counter[str]:
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    arguments.add_argument("--hands", default="light,sapien,mujoco,dynamixel", help=f"of {','.join(HANDS)}")
+    arguments.add_argument("--hands", default=",".join(HANDS))
     arguments.add_argument("--kills", type=int, default=50, help="of each")
-    arguments.add_argument("--seed", type=int, default=1000)
     given = arguments.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     parts = []
     for kind in given.hands.split(","):
-        ends = kills(kind, given.kills, given.seed)
+        ends = kills(kind, given.kills)
         right = sum(ends[end] for end in RIGHT)
         print(f"{kind}: {', '.join(f'{n} {reason}' for reason, n in ends.most_common())}")
         parts.append(f"{kind} {right}/{given.kills}")

@@ -1,7 +1,6 @@
 """Measure, and write the pages of docs/benchmarks.
 
     python benchmarks/write_pages.py generalize speed     # these pages; without names: all
-    python benchmarks/write_pages.py --list               # every page with its commands
     python benchmarks/write_pages.py speed --quick        # to see that it works; writes to --out only
 
 pages.toml names the commands of each page. A page is made of what they print, or of the reports that they
@@ -254,17 +253,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "benchmark_output", help="where results are kept")
     parser.add_argument("--quick", action="store_true", help="to see that it works; pages go to --out")
     parser.add_argument("--keep", action="store_true", help="use what other commits have measured")
-    parser.add_argument("--list", action="store_true", help="print the commands and end")
     options = parser.parse_args(arguments)
     unknown = [name for name in options.pages if name not in PLAN]
     if unknown:
         parser.error(f"no page {', '.join(unknown)}; there are {', '.join(PLAN)}")
     for name in options.pages or PLAN:
-        if options.list:
-            print(name, *(f"    {part.spoken()}" for part in parts_of(name)), sep="\n")
-        else:
-            folder = options.out if options.quick else PAGES
-            write(name, options.out, folder / f"{name}.md", options.quick, options.keep)
+        folder = options.out if options.quick else PAGES
+        write(name, options.out, folder / f"{name}.md", options.quick, options.keep)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,13 @@
 """Speed of the learners: tables of everything measured in one run, with its ratios.
 
 Twenty inputs, one thread, float64, a full basis with a point added and one pruned at every sample. Plain C,
-compiled on the spot, is the limit; GPyTorch, scikit-learn and river take part where they are installed. What
-is compared takes turns.
+compiled on the spot, is the limit. What is compared takes turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import ctypes
-import importlib.util
 import itertools
 import math
 import shutil
@@ -166,23 +164,6 @@ def gpytorch_fantasy(capacity: int, m: int) -> Callable:
     return Timed(call, new_x, new_y)
 
 
-def gpytorch_svgp(capacity: int, m: int) -> Callable:
-    """One variational step on one sample."""
-    from gpytorch_svgp import GPyTorchSVGP
-
-    return Timed(GPyTorchSVGP(D, m, inducing=capacity).update, *stream(64, m))
-
-
-def sklearn_refit(capacity: int, m: int) -> Callable:
-    """scikit-learn has no update: a fit on the window, hyperparameters fixed."""
-    import sklearn.gaussian_process as gp
-
-    kernel = gp.kernels.RBF(D**0.5) + gp.kernels.WhiteKernel(0.01)
-    x, y = (a.numpy() for a in stream(capacity, m))
-    model = gp.GaussianProcessRegressor(kernel, optimizer=None)
-    return lambda: model.fit(x, y).predict(x[:1], return_std=True)
-
-
 def river_forest(capacity: int, m: int) -> Callable:
     """An update and a prediction of river's adaptive random forest, one per output."""
     from torch_ekm.interop import RiverResidual
@@ -190,14 +171,6 @@ def river_forest(capacity: int, m: int) -> Callable:
     learner = RiverResidual(D, m)
     learner.update(*stream(capacity, m))
     return samples(learner, m)
-
-
-PEERS = {
-    "GPyTorch fantasy + predict": gpytorch_fantasy,
-    "GPyTorch SVGP step": gpytorch_svgp,
-    "scikit-learn refit + predict": sklearn_refit,
-    "river ARF update + predict": river_forest,
-}
 
 
 def microseconds(call: Callable, budget: float = 0.6) -> float:
@@ -288,24 +261,11 @@ def of_fleets() -> Table:
     return table("Fleets of 256, per model", "what | compiled [us] | torch [us]", rows)
 
 
-def of_peers() -> Table:
-    """Other libraries, ours in turns with each."""
-    rows = []
-    for name, make in PEERS.items():
-        module = name.split()[0].replace("scikit-learn", "sklearn")
-        if importlib.util.find_spec(module.lower()) is not None:
-            found = alternately({"peer": make(100, 6), "ours": samples(filled(100, 6), 6)}, rounds=3)
-            rows.append((name, found["peer"], found["ours"], found["peer"] / found["ours"]))
-    columns = "what, 100 points, 6 outputs | peer [us] | update and prediction here [us] | ratio"
-    return table("Other libraries", columns, rows)
-
-
 def main() -> None:
     argparse.ArgumentParser(description=__doc__).parse_args()
     torch.set_num_threads(1)
-    for measure in (against_c, of_fleets, of_peers):
-        if (found := measure()).rows:
-            print(Report("", "", [found]).markdown(level=2), flush=True)
+    for measure in (against_c, of_fleets):
+        print(Report("", "", [measure()]).markdown(level=2), flush=True)
 
 
 if __name__ == "__main__":

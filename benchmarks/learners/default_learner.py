@@ -182,15 +182,11 @@ def _without_outliers(samples: Samples) -> Tensor:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=parse_seeds, default=(0,), help="FIRST:END")
-    parser.add_argument("--samples", type=int, default=2000)
-    parser.add_argument("--stream", nargs="+", default=[], help="only these")
     parser.add_argument("--out", type=Path, default=Path("default_learner_output"))
     parser.add_argument("--quick", action="store_true")
     given = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    n, seeds, only = given.samples, given.seeds, given.stream
-    if given.quick:
-        n, seeds, only = 30, seeds[:1], ["smooth"]
+    n, seeds, only = (30, given.seeds[:1], ["smooth"]) if given.quick else (2000, given.seeds, [])
     tables = [table(n, seeds, only), bars(n, seeds)]
     caption = "Errors of the learners on each stream, over those of the model alone."
     figure = dot_chart(tables[:1], list(LEARNERS), "error / model alone", log=True)

@@ -171,14 +171,13 @@ def table(seeds: Sequence[int], n: int, capacity: int) -> None:
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=parse_seeds, default=tuple(range(40)), help="FIRST:END")
-    parser.add_argument("--samples", type=int, default=240)
     parser.add_argument("--quick", action="store_true")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     if options.quick:
         table(options.seeds[:1], 20, 8)
     else:
-        table(options.seeds, options.samples, 100)
+        table(options.seeds, 240, 100)
 
 
 if __name__ == "__main__":
