@@ -37,7 +37,7 @@ PLAN = tomllib.loads((HERE / "pages.toml").read_text(encoding="utf-8"))
 #: What decides the figures, and the peers that are measured, too.
 PACKAGES = (
     "torch_ekm", "torch", "numpy", "scipy", "sapien", "mujoco", "opencv-python", "coal", "qpsolvers",
-    "piqp", "numba", "gpytorch", "scikit-learn", "river", "capymoa", "stable-baselines3",
+    "piqp", "numba", "gpytorch", "scikit-learn", "river", "stable-baselines3",
 )  # fmt: skip
 
 _MOST_ROWS = 8  # of a table that is shown; others are CSV files

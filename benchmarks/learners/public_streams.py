@@ -5,14 +5,12 @@
 Protocols are those of the libraries. river's regression track: river's own ``progressive_val_score``; a
 prediction of None, before the first sample, is not scored (river's forest does the same). CapyMOA's
 prequential evaluation on Fried: predict, score, learn; the first prediction is 0 and is scored, as that of
-MOA's learners. ``--quick`` runs the first samples only. Peers are run where they can be imported; CapyMOA
-needs Java and pandas 2, so it has its own environment.
+MOA's learners. ``--quick`` runs the first samples only.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import math
 import os
 import sys
@@ -21,12 +19,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
-from capymoa_regressor import CapyMOARegressor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from dots import dot_chart
@@ -34,7 +30,7 @@ from dots import dot_chart
 from torch_ekm import default_learner
 from torch_ekm.experiments.reporting.plots import save_figure
 from torch_ekm.experiments.reporting.report import Cell, Column, Report, Table
-from torch_ekm.interop import as_river
+from torch_ekm.interop import OnlineRegressor, as_river
 from torch_ekm.residual import LearnHyperparameters, RobustWeight, SparseOnlineGP, Standardize
 from torch_ekm.typing import Array
 
@@ -116,41 +112,19 @@ def river_peers() -> dict[str, Callable[[], Any]]:
 
 def fried(method: str, factory: Callable, x: Array, y: Array) -> Iterator[Row]:
     """The first 1000 samples and all of them, in one pass."""
-    model = CapyMOARegressor(learner=factory)
-    ends, begin = np.empty((len(y), 3)), time.perf_counter()
-    for t, (row, target) in enumerate(zip(x, y, strict=True)):
-        instance = SimpleNamespace(x=row, y_value=target)
-        ends[t] = model.predict_interval(instance)
-        model.train(instance)
+    model = OnlineRegressor(factory(x.shape[1], 1))
+    ends, begin = np.zeros((len(y), 2)), time.perf_counter()
+    for t in range(len(y)):
+        if t:
+            ends[t] = np.ravel(model.interval(x[t : t + 1], 0.95))
+        model.learn(x[t], y[t : t + 1])
         if t + 1 in (1000, len(y)):
-            low, mean, high = ends[: t + 1].T
-            error, milliseconds = y[: t + 1] - mean, 1e3 * (time.perf_counter() - begin) / (t + 1)
+            low, high = ends[: t + 1].T
+            error, milliseconds = y[: t + 1] - (low + high) / 2, 1e3 * (time.perf_counter() - begin) / (t + 1)
             held, width = (low <= y[: t + 1]) & (y[: t + 1] <= high), (high - low).mean() / np.ptp(y[: t + 1])
             name = "Fried, first 1000" if t + 1 == 1000 else "Fried"
             rms, mae = math.sqrt(np.square(error).mean()), np.abs(error).mean()
             yield Row(name, method, rms, "here", held.mean(), width, t + 1, mae, milliseconds)
-
-
-def capymoa_peers(x: Array, y: Array) -> Iterator[Row]:
-    """Its regressors and interval learners, by its own evaluation."""
-    from capymoa.evaluation import prequential_evaluation
-    from capymoa.regressor import SOKNL, AdaptiveRandomForestRegressor, KNNRegressor
-    from capymoa.stream import NumpyStream
-    from capymoa.uncertainty import MVE, AdaPI
-
-    stream = NumpyStream(x, y, dataset_name="Fried", target_type="numeric")
-    for name, n in (("Fried, first 1000", 1000), ("Fried", len(y))):
-        for kind in (KNNRegressor, SOKNL, AdaptiveRandomForestRegressor, AdaPI, MVE):
-            begin = time.perf_counter()
-            result = prequential_evaluation(stream, kind(stream.get_schema()), max_instances=n).cumulative
-            milliseconds = 1e3 * (time.perf_counter() - begin) / n
-            method, interval = f"CapyMOA {kind.__name__}, again", kind in (AdaPI, MVE)
-            if interval:
-                share, width = result.coverage() / 100, result.nmpiw() / 100
-                yield Row(name, method, None, "here", share, width, n, None, milliseconds)
-            else:
-                rmse, mae = result.rmse(), result.mae()
-                yield Row(name, method, rmse, samples=n, mae=mae, milliseconds=milliseconds)
 
 
 def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
@@ -168,8 +142,6 @@ def measure(data: Path | None, limit: int | None) -> Iterator[Row]:
     for method, factory in OURS.items():
         torch.manual_seed(SEED)
         yield from fried(method, factory, x, y)
-    if importlib.util.find_spec("capymoa"):
-        yield from capymoa_peers(x, y)
 
 
 def tables(rows: list[Row]) -> list[Table]:

@@ -52,13 +52,8 @@ demo box --jobs 0 | --jobs
 demo box --out file.txt | cannot be written
 reproduce nothing | unknown experiment
 reproduce online --objects box | 'online' does not take it
-reproduce online --angles 5 | 'online' does not take it
 reproduce generalize --objects nothing | unknown object
 reproduce generalize --objects , | at least one object
-reproduce generalize --angles x | numbers separated by commas
-reproduce generalize --angles 0 | angles between 0 and 180 deg
-reproduce generalize --angles nan | angles between 0 and 180 deg
-reproduce generalize --angles 400 | angles between 0 and 180 deg
 reproduce generalize --preset bad | unknown preset
 reproduce generalize --learner bad | unknown learner
 compare | Missing option '--data'
@@ -75,9 +70,7 @@ compare --data s.csv --targets a,y | at least one must be an input
 compare --data s.csv --limit -1 | --limit
 compare --data s.csv --limit 3 | too short
 compare --data s.csv --learners SOGP --out file.txt | cannot be written
-show nothing | unknown hand or log
-show file.txt | damaged, or not a recording
-show folder | no log
+show nothing | unknown hand
 show finger.urdf | no link has a <visual> or <collision>
 show icub_right --seed -1 | --seed
 show icub_right --reach | without an object

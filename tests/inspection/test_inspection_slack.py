@@ -6,13 +6,11 @@ import math
 import random
 import re
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-import torch
 
 pytest.importorskip("dynamixel_sdk")
 pytest.importorskip("typer")
@@ -23,12 +21,11 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app, main
 from torch_ekm.control import HandKnowledge
-from torch_ekm.drivers import BusReading, DynamixelPlant, HandDriver, Wiring
+from torch_ekm.drivers import DynamixelPlant, Wiring
 from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
 from torch_ekm.inspection.identify_servo import identify_servo
 from torch_ekm.inspection.new_wiring import new_wiring
 from torch_ekm.inspection.slack import Taut, find_slack, write_zeros
-from torch_ekm.kinematics import Play
 
 DEG = math.pi / 180
 TICKS = 4096 / (2 * math.pi)
@@ -139,49 +136,6 @@ def test_identify_servo_over_the_bus(bus, tmp_path, monkeypatch, capsys) -> None
     assert servo.bias.tolist() == pytest.approx([3 / TICKS, -3 / TICKS], abs=0.06 * DEG)
     said = capsys.readouterr().out
     assert "left: d=0.7" in said
-    assert "no joint sensor measures its play" in said
-
-
-class WithJoints(HandDriver):
-    """A T42 on a bench with play between motors and joints."""
-
-    def __init__(self, path: Path, play: tuple[float, float]) -> None:
-        super().__init__(Wiring.read(path, "dynamixel", TICKS, ("port", "baud")))
-        self.a = torch.tensor([0.9, 0.7], dtype=torch.float64)
-        self.play, self.draw = Play(torch.tensor(play, dtype=torch.float64)), random.Random(1)
-        self.x, self.state = self.a.clone(), self.play.at(torch.zeros(2).double())
-
-    def _read(self) -> BusReading:
-        now = time.monotonic()
-        q = [0.7 * self.x[0], 0.6 * self.x[0], 0.9 * self.x[1], 0.4 * self.x[1]]
-        joints = [float(x) + self.draw.gauss(0, 0.05 * DEG) for x in q]
-        motors = [one.bus(float(x)) for one, x in zip(self.wiring.motors, self.a, strict=True)]
-        return BusReading(motors, now, joints=joints, joints_taken=now)
-
-    def _write(self, goal: Sequence[float], seconds: float) -> None:
-        wanted = [one.value(x) for one, x in zip(self.wiring.motors, goal, strict=True)]
-        moved = torch.tensor(wanted, dtype=torch.float64) - self.a
-        pulled, self.state = self.play.advance(self.state, moved)
-        self.x, self.a = self.x + pulled, self.a + moved
-
-    def _release(self) -> None:
-        pass
-
-
-def test_joint_sensors_tell_the_play(tmp_path) -> None:
-    path = tmp_path / "hand.toml"
-    joints = [f'[[joints]]\nname = "{name}"\nid = {k}\nper_rad = 1\n' for k, name in enumerate(
-        ("left_0", "left_1", "right_0", "right_1"))]  # fmt: skip
-    path.write_text(TEXT + "".join(joints))
-    told: list[str] = []
-    found = identify_servo(WithJoints(path, (2.0 * DEG, 0.5 * DEG)), told.append)
-    for play, width in zip(found.play, (2.0, 0.5), strict=True):
-        assert play is not None
-        assert play[0] / DEG == pytest.approx(width, abs=0.15)
-        assert play[1] / DEG < 0.15
-    assert found.servo.dead_zone.tolist() == pytest.approx([0, 0], abs=0.01 * DEG)
-    assert told == ["left", "right"]
-    assert 'name = "left"\nbacklash_deg = ' in str(found)
 
 
 def test_a_motor_that_stands_still_is_named(bus, tmp_path) -> None:

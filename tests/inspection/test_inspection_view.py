@@ -84,8 +84,6 @@ def test_a_log_is_played_from_command_to_command(folder) -> None:
     assert len(seen.scene.transforms) == len(seen.rows) == 3
     for k, one in enumerate(recording.observations):
         np.testing.assert_allclose(seen.scene.transforms[k, -1, :3, 3], one.truth.position, atol=1e-12)
-    estimated = view_log(folder, trial=1, estimates=True).scene.transforms[1, -1, :3, 3]
-    np.testing.assert_allclose(estimated, recording.observations[1].position, atol=1e-12)
     assert seen.rows[0][1:3] == ("held", "0.0")
     assert "+1.7" in seen.rows[1][4]  # 0.03 rad
 
@@ -140,10 +138,8 @@ def test_what_a_page_tells_is_of_its_frames(folder, tmp_path) -> None:
 
 
 def test_what_cannot_be_shown_is_named(folder, tmp_path) -> None:
-    with pytest.raises(UnknownNameError, match=r"icub_right.*a log's folder"):
+    with pytest.raises(UnknownNameError, match="icub_right"):
         view("nonsense")
-    with pytest.raises(ParameterError, match="left out with a log"):
-        view(str(folder), object="box")
     for path, trial, said in (
         (folder, 2, "nothing to show: not grasped"),
         (folder, 7, "no trial 7; there are 0, 1, 2"),

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from .._extras import versions_of
-from .._files import figure
 from .._terminal import console, say  # first: needs the extra
 from ..exceptions import ParameterError
 
@@ -92,18 +91,6 @@ def parse_seeds(text: str) -> tuple[int, ...]:
         return tuple(range(start, stop))
     valid = f"FIRST:END with 0 <= FIRST < END <= {_LARGEST_SEED}, e.g. 1000:1006, or one number below that"
     raise ParameterError("seeds", text, valid)
-
-
-def parse_angles(text: str) -> tuple[float, ...]:
-    """``"10,20"`` as (10.0, 20.0) [deg].
-
-    Raises:
-        ParameterError: no numbers.
-    """
-    angles = tuple(angle for word in names(text) if (angle := figure(word)) is not None)
-    if not angles or len(angles) < len(names(text)):
-        raise ParameterError("angles", text, "numbers separated by commas, e.g. 10,20")
-    return angles
 
 
 def names(text: str) -> tuple[str, ...]:

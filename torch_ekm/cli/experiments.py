@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from .._terminal import console, print_report, progress, say, say_next
 from ..exceptions import ParameterError
-from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, parse_angles, parse_seeds
+from ._app import AN_OBJECT, Engine, Hand, Jobs, Preset, Sensing, app, names, parse_seeds
 
 import typer  # isort: skip
 from typer import Argument, Option  # isort: skip
@@ -60,7 +60,6 @@ def reproduce(
     engine: Engine = "sapien",
     learner: Annotated[str, Option(help="action-linear, rbf, or model alone.")] = "action-linear",
     sensing: Sensing = True,
-    angles: Annotated[str, Option(help="Turns [deg], e.g. 5,10; else shares of each end (generalize).")] = "",
 ) -> None:
     """Repeat the paper's experiments.
 
@@ -79,7 +78,6 @@ def reproduce(
 
     setting = Setting(hand=hand, preset=preset, engine=engine, learner=learner, sensing=sensing)
     changes = {"objects": names(objects)} if objects else {}
-    changes |= {"angles_deg": parse_angles(angles)} if angles else {}
     planned = plan(experiment, parse_seeds(seeds), quick=quick, setting=setting, **changes)
     _run(experiment, planned, out or Path(f"reproduce_{experiment}"), jobs)
     say_next("the whole of it: the same command without --quick" if quick else "open the report")

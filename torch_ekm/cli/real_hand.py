@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,10 +75,9 @@ def drivers(
 
 @app.command(name="identify-servo")
 def identify_servo(plant: Wired, out: Learned = None) -> None:
-    """Find dead zone, bias and play of each motor of a real hand, by motions of 0.4 to 2 deg.
+    """Find dead zone and bias of each motor of a real hand, by motions of 0.4 to 2 deg.
 
-    Takes some 10 s for each motor; the empty hand does best. No model of the hand is needed. Play shows at
-    joint sensors only; its lines are for the hand's transmission file. With --out: dead zones and biases, for
+    Takes some 10 s for each motor; the empty hand does best. No model of the hand is needed. With --out: for
     a closed loop to begin with.
     """
     from ..control import HandKnowledge
@@ -91,7 +89,7 @@ def identify_servo(plant: Wired, out: Learned = None) -> None:
         knowledge = HandKnowledge.of(driver.hand)
     say(found)
     if out is not None:
-        knowledge.servo = found.servo
+        knowledge.servo = found
         knowledge.save(out)
         say(f"Written:   {out.resolve()}")
         say_next(f"ClosedLoop(..., knowledge=HandKnowledge.load({str(out)!r}))")
@@ -103,15 +101,12 @@ def identify_servo(plant: Wired, out: Learned = None) -> None:
 def health(
     logs: Annotated[list[Path], Argument(metavar="LOG...", help="Folders of logs of one hand, in order.")],
     hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
-    knowledge: Learned = None,
 ) -> None:
     """Report which actuator of a hand changed, by how much and since when.
 
     Read from ordinary motions in its trial logs: what tendons pass on, dead zones and biases of the servos.
-    With --knowledge: also the figures that a closed loop learned. Tendons show at measured joints only. Ends
-    with 1 if something changed.
+    Tendons show at measured joints only. Ends with 1 if something changed.
     """
-    from ..control import HandKnowledge
     from ..description import load_hand
     from ..inspection.health import BASELINE, HealthChange, hand_health
     from ..plant import Trajectory, TrialLog
@@ -132,9 +127,6 @@ def health(
     found = hand_health(load_hand(name).counted(), trials())
     if found:
         print_table(HealthChange._fields, found, str(name))
-    if knowledge is not None:
-        say(HandKnowledge.load(knowledge).figures)
-    if found:
         say_next(
             "mend or describe what changed; torch-ekm knowledge FILE --reset forgets what was learned of it"
         )
@@ -147,66 +139,46 @@ def health(
 @app.command()
 def knowledge(
     file: Annotated[Path, Argument(metavar="EKM", help="File of what a closed loop has learned of a hand.")],
-    hand: Annotated[str, Option(help="The hand; else the one that it was learned of.")] = "",
     reset: Annotated[list[str], Option(help="servo, forces, figures or error: forget it; repeatable.")] = [],  # noqa: B006
-    json: Annotated[bool, Option("--json", help="All figures, as JSON.")] = False,
 ) -> None:
-    """Show the estimates of a hand, and which of them differ from its description.
+    """Show what a closed loop has learned of a hand, with standard errors.
 
-    Differences are those of more than two standard errors. With --reset parts are forgotten; the file as it
-    was is kept beside, with the ending .previous.
+    With --reset parts are forgotten; the file as it was is kept beside, with the ending .previous.
     """
     from ..control import HandKnowledge
-    from ..inspection.knowledge import Estimated, about, estimates
 
     learned = HandKnowledge.load(file)
     for part in reset:
         learned.reset(part)  # pyright: ignore[reportArgumentType]
     if reset:
         learned.save(file)
-    head, found = about(learned, file, hand), estimates(learned)
-    if json:
-        say(dumps({**head, "estimates": [one._asdict() for one in found]}, indent=1))
-        return
-    for name, value in head.items():
-        say(f"{name + ':':13}{value}")
-    rows = [
-        (one.part, one.name, one.figure, *map(_short, (one.value, one.std, one.described)), one.note)
-        for one in found
-        if one.deviates
-    ]
-    print_table([*Estimated._fields[:3], "estimated", "+-", "described", ""], rows, str(file))
-    say(f"{len(found) - len(rows)} figures are as described, or not identified (--json lists them).")
+    say(learned)
+    say(learned.figures)
     say_next(f"torch-ekm knowledge {file} --reset servo forgets a part, after a repair say")
-
-
-def _short(value: float | None) -> str:
-    return "" if value is None else f"{value:.3g}"
 
 
 @app.command()
 def show(
-    what: Annotated[str, Argument(metavar="[HAND|LOG]", help="A hand, a URDF, or a log.")] = "icub_right",
+    hand: Annotated[str, Argument(help="A hand (see 'torch-ekm hands') or a path to a URDF.")] = "icub_right",
     object: Annotated[str | None, Option(help="An object for the hand to hold.")] = None,
     seed: Annotated[int, Option(min=0, help="Which grasp of the object.")] = 0,
     reach: Annotated[bool, Option(help="How far it can be turned, and what ends it.")] = False,
     html: Page = Path("view.html"),
 ) -> None:
-    """Write a page that shows a hand, a grasp or a log in any browser.
+    """Write a page that shows a hand or a grasp in any browser.
 
     A hand closes and opens each actuator in turn. In a grasp each actuator is moved by 5 deg, in simulation,
-    and the table shows the effect on the object. A log is played.
+    and the table shows the effect on the object.
     """
     from ..inspection.view import view
 
-    _show(view(what, object, seed, reach=reach), html)
+    _show(view(hand, object, seed, reach=reach), html)
 
 
 @app.command()
 def replay(
     log: Annotated[Path, Argument(help="A log's folder, or the file of one trial.")],
     trial: Annotated[int | None, Option(min=0, help="Which trial; the first one by default.")] = None,
-    estimates: Annotated[bool, Option(help="Show what was measured, not the truth.")] = False,
     html: Page = Path("view.html"),
 ) -> None:
     """List the trials of a log, and play one on a page."""
@@ -215,7 +187,7 @@ def replay(
     from ..plant.trial_log import TrialEntry
 
     found = None if log.is_file() else TrialLog.open(log)
-    shown = view_log(log if found is None else found, trial, estimates=estimates)
+    shown = view_log(log if found is None else found, trial)
     if found is not None:
         header = ["time [s]" if name == "time" else name for name in TrialEntry._fields]
         print_table(header, found.index, str(log))

@@ -16,7 +16,7 @@ from ..description._reading import toml_text
 from ..drivers import HandDriver, Wiring
 from ..exceptions import DescriptionError, DeviceError
 from ..plant import Gate
-from .identify_servo import nearest_column
+from ..typing import Array
 
 _STEP = math.radians(1)
 _LOOKS = 5  # readings of the load after each step
@@ -106,12 +106,20 @@ def _close(driver: HandDriver, i: int, on_step: Callable[[str], object]) -> tupl
         gate.command(delta, by="slack")
     a, load = np.array(way).T
     knots = np.linspace(a[0], a[-1], 40 * len(a), endpoint=False)
-    at, std, _ = nearest_column(knots, np.maximum(0, a[:, None] - knots), load)
+    at, std = _nearest_column(knots, np.maximum(0, a[:, None] - knots), load)
     if not problem and at < a[2]:
         problem = "its load rises from the start: let the tendon out until it is slack, then once more"
     if problem:
         raise DeviceError(f"motor '{motor.name}'", problem)
     return at, std
+
+
+def _nearest_column(grid: Array, X: Array, y: Array) -> tuple[float, float]:
+    """``min_k |y - c - g X[:, k]|^2``: the grid's value there, and its standard deviation."""
+    X, y = X - X.mean(0), y - y.mean()
+    squares = y @ y - np.square(y @ X) / np.maximum(np.square(X).sum(0), 1e-300)
+    as_good = grid[squares <= squares.min() * (1 + 1 / max(1, len(y) - 3))]
+    return float(grid[squares.argmin()]), float(np.ptp(as_good) / 2)
 
 
 def _position_and_load(driver: HandDriver, i: int) -> tuple[float, float]:

@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from ..control import ClosedLoop, LookAndMoveController, Reach
-from ..description import HandDescription, list_hands, load_hand, load_object
-from ..description.registry import HAND_FILES
-from ..exceptions import DescriptionError, ParameterError, UnknownNameError
+from ..description import HandDescription, load_hand, load_object
+from ..exceptions import DescriptionError, ParameterError
 from ..kinematics import ActuationMap, GraspState
 from ..kinematics.poses import log as rotation_vector
 from ..model import KinematicModel
@@ -43,8 +42,8 @@ class View:
     """What could not be drawn."""
 
 
-def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = False) -> View:
-    """A hand (name or file), alone or holding an object, or the first trial of a log.
+def view(hand: str, object: str | None = None, seed: int = 0, *, reach: bool = False) -> View:
+    """A hand (name or file), alone or holding an object.
 
     Args:
         object: name or URDF.
@@ -52,23 +51,15 @@ def view(what: str, object: str | None = None, seed: int = 0, *, reach: bool = F
         reach: how far it can be turned.
 
     Raises:
-        UnknownNameError: no such hand, and no log of that name; the message lists the hands.
-        ParameterError: an object was given to a log, or none to a hand whose reach is asked for.
-        DescriptionError: the log is damaged or has nothing to show.
+        UnknownNameError: no such hand; the message lists them.
+        ParameterError: no object is given, whose reach is asked for.
         EquilibriumError, GraspError: the object cannot be pinched by this hand.
     """
-    path = Path(what)
-    if what not in list_hands() and path.suffix not in HAND_FILES:
-        if not path.exists():
-            raise UnknownNameError("hand or log", what, (*list_hands(), "a URDF file", "a log's folder"))
-        if object is not None:
-            raise ParameterError("object", object, "left out with a log, which names its own")
-        return view_log(path)
     if object is None:
         if reach:
             raise ParameterError("reach", reach, "False without an object: it is that of a grasp")
-        return view_hand(load_hand(what).counted())
-    plant = SimulatedHand(what, object)
+        return view_hand(load_hand(hand).counted())
+    plant = SimulatedHand(hand, object)
     try:
         seen = plant.reset(seed)
         return _reach(plant) if reach else _grasp(plant, seen)
@@ -148,13 +139,12 @@ def _along(
     return found, rows
 
 
-def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool = False) -> View:
+def view_log(log: Path | TrialLog, trial: int | None = None) -> View:
     """One trial of a log, command by command: the truth where it is known, else what was estimated.
 
     Args:
         log: a log, its folder, or one trial's file.
         trial: which; the first one by default.
-        estimates: show what was estimated although the truth is known.
 
     Raises:
         DescriptionError: no such log or trial, a damaged or empty one, or one that does not name its
@@ -178,7 +168,7 @@ def view_log(log: Path | TrialLog, trial: int | None = None, *, estimates: bool 
             raise DescriptionError(log, f"its configuration names no {name}, needed to draw it")
     hand, obj = load_hand(configuration["hand"]).counted(), load_object(configuration["object"])
     gravity = np.array(configuration.get("gravity", hand.gravity), dtype=np.float64)
-    states = [seen.state if estimates else _truth(seen) for seen in trajectory.observations]
+    states = [_truth(seen) for seen in trajectory.observations]
     if states[0].q.shape[-1] != hand.n_q:
         problem = f"has {states[0].q.shape[-1]} joints, the hand '{hand.name}' {hand.n_q}: of another hand"
         raise DescriptionError(log, problem)
