@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+import textwrap
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 
 console = Console(markup=False)  # the units of a table are no styles, nor is "[red]" in a file
 _PIPED = 120  # characters of a line in a file or a pipe, which has no width of its own
+_SHORT = 34  # characters: what is longer is prose, which may be wrapped
+_FIGURE = re.compile(r"[-+]?\d[\d.e+-]*(?: \[[^\]]*\])?(?: (?:%|deg\b|mm\b))?")
 # control characters, formats such as a change of the direction of writing, halves of characters
 _UNPRINTED = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
@@ -96,9 +100,15 @@ def progress(what: str, total: int, seconds: float = 0.0) -> Iterator[Callable[[
             raise
 
 
+def unbroken(text: str, width: int) -> str:
+    """Lines of at most this width, with figures, their intervals and units on one."""
+    kept = _FIGURE.sub(lambda found: found[0].replace(" ", "\u00a0"), text)
+    return textwrap.fill(kept, width, break_long_words=False, break_on_hyphens=False).replace("\u00a0", " ")
+
+
 def print_report(report: Report, folder: Path, notes: bool = False, every: bool = False) -> None:
     """What came of it, the leading tables or every one, and where the page is, which has all."""
-    console.print(as_printed(report.summary), highlight=False)
+    say(unbroken(as_printed(report.summary), console.width))
     for table in report.tables if every else report.tables[: max(report.leading, 1)]:
         print_table(table.header, table.text(), table.caption, table.note if notes else None)
     if report.figures:
@@ -109,13 +119,37 @@ def print_report(report: Report, folder: Path, notes: bool = False, every: bool 
 def print_table(
     header: Iterable[str], rows: Iterable[Iterable[object]], title: str | None = None, note: str | None = None
 ) -> None:
-    """Cells are text as it stands, broken into lines where the terminal is narrow, never cut short."""
+    """Cells are text as it stands, never cut short; figures with their intervals are not broken over lines.
+
+    A table that is too wide for the terminal is printed in parts, each with the first column.
+    """
+    head, cells = [*map(as_printed, header)], [[*map(as_printed, row)] for row in rows]
     screen = console if console.is_terminal else Console(width=_PIPED, markup=False)
-    table = RichTable(title=as_printed(title) if title else None)
-    for name in header:
-        table.add_column(as_printed(name), overflow="fold")
-    for row in rows:
-        table.add_row(*map(as_printed, row))
-    screen.print(table)
+    parts = _parts([_width(column) for column in zip(head, *cells, strict=True)], screen.width)
+    for number, columns in enumerate(parts):
+        table = RichTable(title=as_printed(title) if title and not number else None)
+        for column in columns:
+            figures = all(len(row[column]) <= _SHORT for row in cells)
+            table.add_column(head[column], overflow="fold", no_wrap=figures and len(head[column]) <= _SHORT)
+        for row in cells:
+            table.add_row(*(row[column] for column in columns))
+        screen.print(table)
     if note:
-        screen.print(as_printed(note), highlight=False)
+        screen.print(unbroken(as_printed(note), screen.width), highlight=False)
+
+
+def _width(column: Sequence[str]) -> int:
+    """Of a column with its borders, where prose may be wrapped."""
+    return min(max(map(len, column)), _SHORT) + 3
+
+
+def _parts(widths: Sequence[int], screen: int) -> list[list[int]]:
+    """Columns of each part of a table: the first, and as many others as there is room for, one at least."""
+    parts, room = [[0]], screen - widths[0] - 1
+    for column, width in enumerate(widths[1:], start=1):
+        if width > room and len(parts[-1]) > 1:
+            parts.append([0])
+            room = screen - widths[0] - 1
+        parts[-1].append(column)
+        room -= width
+    return parts

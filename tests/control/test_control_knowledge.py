@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -204,9 +205,17 @@ def test_what_is_believed_is_shown(driven, tmp_path) -> None:
     driven.knowledge.save(path)
     shown = CliRunner().invoke(app, ["knowledge", str(path)])
     assert shown.exit_code == 0, shown.output
-    assert f"motions={int(driven.knowledge.figures.count)}" in shown.output
-    assert f"thumb_distal: d={float(driven.knowledge.servo.dead_zone[3]) / DEG:.2f}" in shown.output
-    assert str(driven.knowledge.figures) in shown.output
+    assert "motions:" in shown.output
+    assert "that of 'icub_right'" in shown.output
+    other = CliRunner().invoke(app, ["knowledge", str(path), "--hand", "planar_two_finger", "--json"])
+    told = json.loads(other.output)
+    assert "a hand with the actuators" in told["description"]
+    assert told["motions"] == int(driven.knowledge.figures.count)
+    found = {(one["name"], one["figure"]): one for one in told["estimates"]}
+    assert found["thumb_distal", "dead zone [deg]"]["value"] == pytest.approx(
+        float(driven.knowledge.servo.dead_zone[3]) / DEG
+    )
+    assert len(told["estimates"]) == 2 * 9 + 5 + len(driven.knowledge.figures) + 2
     assert CliRunner().invoke(app, ["knowledge", str(path), "--reset", "servo"]).exit_code == 0
     assert not bool(HandKnowledge.load(path).servo.estimate.any())
     assert bool(HandKnowledge.load(previous(path)).servo.estimate.any())

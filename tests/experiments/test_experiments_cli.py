@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 import typer
+from rich.console import Console
 from typer.testing import CliRunner
 
-from torch_ekm._terminal import as_printed, print_report, progress
+from torch_ekm._terminal import as_printed, print_report, print_table, progress, unbroken
 from torch_ekm.cli import app, main
 from torch_ekm.cli._app import GROUPS, names
 from torch_ekm.experiments.reporting.report import FigureFile, Report, Table
@@ -61,6 +62,32 @@ def test_the_help_tells_how_much_there_is_to_run() -> None:
     text = COMMANDS["reproduce"].help
     for name in PROTOCOLS:
         assert re.search(rf"{name} +{len(plan(name).jobs)} ", text), name
+
+
+def test_figures_with_their_intervals_are_not_broken_over_lines() -> None:
+    text = "The E-KM ends 0.10 [0.07, 0.12] deg from the target, KM+S 101 [99, 107] % of that."
+    for width in range(20, 90):
+        lines = unbroken(text, width).split("\n")
+        assert " ".join(lines) == text
+        for figure in ("0.10 [0.07, 0.12] deg", "101 [99, 107] %"):
+            assert sum(figure in line for line in lines) == 1
+
+
+@pytest.mark.parametrize("width", [60, 100])
+def test_a_table_that_is_too_wide_is_printed_in_parts(
+    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import torch_ekm._terminal as terminal
+
+    monkeypatch.setattr(terminal, "console", Console(markup=False, force_terminal=True, width=width))
+    cells = [["box", *(f"0.{k}1 [0.01, 0.99]" for k in range(9))], ["can", *["-"] * 9]]
+    print_table(["object", *(f"error {k} [deg]" for k in range(9))], cells, "Title", "Note")
+    printed = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert printed.count("box") == printed.count("can") > 1
+    assert printed.count("Title") == printed.count("Note") == 1
+    for k in range(9):
+        assert printed.count(f"0.{k}1 [0.01, 0.99]") == printed.count(f"error {k} [deg]") == 1
+    assert max(map(len, printed.splitlines())) <= width
 
 
 def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -148,7 +148,7 @@ def test_wide_tables_are_printed_whole_into_a_file(capsys: pytest.CaptureFixture
     table = Table("wide", "Wide", [f"recording {k}" for k in range(12)], [["first", *[cell] * 11]], "")
     print_report(Report("", "", [table]), Path())
     out = capsys.readouterr().out
-    assert [out.count(word) for word in cell.split()] == [11, 11, 11]
+    assert out.count(cell) == 11
     assert max(map(len, out.splitlines())) <= 120
 
 

@@ -72,6 +72,7 @@ def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Pat
         "controllers.csv",
         "prediction_error.svg",
         "steady_state_error.svg",
+        "hand.png",
         "animation.html",
         "configuration.json",
     ):

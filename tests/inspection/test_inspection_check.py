@@ -233,6 +233,17 @@ def test_a_pinch_that_the_usual_faults_break_is_told(monkeypatch):
 
 
 @pytest.mark.usefixtures("brief")
+def test_rigid_actuators_that_contradict_each_other_are_told(monkeypatch):
+    hand = load_hand("icub_right")
+    rigid = tuple(dataclasses.replace(actuator, stiffness=float("inf")) for actuator in hand.actuators)
+    hand = dataclasses.replace(hand, actuators=rigid)
+    monkeypatch.setattr(module, "load_hand", lambda _: hand)
+    rows = {row.name: row for row in check_hand("mine")}
+    assert "thumb_distal 100" in rows["actuators"].found
+    assert rows["actuators in the pinch"].state == "warning"
+
+
+@pytest.mark.usefixtures("brief")
 def test_command_line(files, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "save_picture", lambda scene, path: path)
     runner = CliRunner()

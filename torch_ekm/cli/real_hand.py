@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -101,12 +102,15 @@ def identify_servo(plant: Wired, out: Learned = None) -> None:
 def health(
     logs: Annotated[list[Path], Argument(metavar="LOG...", help="Folders of logs of one hand, in order.")],
     hand: Annotated[str, Option(help="The hand; else the one that the first log names.")] = "",
+    knowledge: Learned = None,
 ) -> None:
     """Report which actuator of a hand changed, by how much and since when.
 
     Read from ordinary motions in its trial logs: what tendons pass on, dead zones and biases of the servos.
-    Tendons show at measured joints only. Ends with 1 if something changed.
+    With --knowledge: also the figures that a closed loop learned. Tendons show at measured joints only. Ends
+    with 1 if something changed.
     """
+    from ..control import HandKnowledge
     from ..description import load_hand
     from ..inspection.health import BASELINE, HealthChange, hand_health
     from ..plant import Trajectory, TrialLog
@@ -127,6 +131,9 @@ def health(
     found = hand_health(load_hand(name).counted(), trials())
     if found:
         print_table(HealthChange._fields, found, str(name))
+    if knowledge is not None:
+        say(HandKnowledge.load(knowledge).figures)
+    if found:
         say_next(
             "mend or describe what changed; torch-ekm knowledge FILE --reset forgets what was learned of it"
         )
@@ -139,22 +146,41 @@ def health(
 @app.command()
 def knowledge(
     file: Annotated[Path, Argument(metavar="EKM", help="File of what a closed loop has learned of a hand.")],
+    hand: Annotated[str, Option(help="The hand; else the one that it was learned of.")] = "",
     reset: Annotated[list[str], Option(help="servo, forces, figures or error: forget it; repeatable.")] = [],  # noqa: B006
+    json: Annotated[bool, Option("--json", help="All figures, as JSON.")] = False,
 ) -> None:
-    """Show what a closed loop has learned of a hand, with standard errors.
+    """Show the estimates of a hand, and which of them differ from its description.
 
-    With --reset parts are forgotten; the file as it was is kept beside, with the ending .previous.
+    Differences are those of more than two standard errors. With --reset parts are forgotten; the file as it
+    was is kept beside, with the ending .previous.
     """
     from ..control import HandKnowledge
+    from ..inspection.knowledge import Estimated, about, estimates
 
     learned = HandKnowledge.load(file)
     for part in reset:
         learned.reset(part)  # pyright: ignore[reportArgumentType]
     if reset:
         learned.save(file)
-    say(learned)
-    say(learned.figures)
+    head, found = about(learned, file, hand), estimates(learned)
+    if json:
+        say(dumps({**head, "estimates": [one._asdict() for one in found]}, indent=1))
+        return
+    for name, value in head.items():
+        say(f"{name + ':':13}{value}")
+    rows = [
+        (one.part, one.name, one.figure, *map(_short, (one.value, one.std, one.described)), one.note)
+        for one in found
+        if one.deviates
+    ]
+    print_table([*Estimated._fields[:3], "estimated", "+-", "described", ""], rows, str(file))
+    say(f"{len(found) - len(rows)} figures are as described, or not identified (--json lists them).")
     say_next(f"torch-ekm knowledge {file} --reset servo forgets a part, after a repair say")
+
+
+def _short(value: float | None) -> str:
+    return "" if value is None else f"{value:.3g}"
 
 
 @app.command()

@@ -35,6 +35,7 @@ from . import Check, State
 _SURFACE = 2e-4  # [m] between a pad and its link's collision shape, and of an object from its grasp_width
 _RANGES = (0.05, 5.0)  # of what the joints allow; beyond them a figure has another unit
 _LOW_MARGIN = 0.1  # of the friction cone
+_CONTRADICT = 1e4  # [N/rad]: 100 N for 0.6 deg; soft actuators have some hundreds
 _STABLE = 1e-6  # [N m/rad]; less is none
 _TAUT = 1e-6  # [N m]
 _LEAST_SLACK = 0.005  # of an actuator's range; less is a spring that just rests
@@ -312,6 +313,10 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
     state: State = "error" if few or stability < _STABLE else "ok" if good else "warning"
     remedy = "" if state == "ok" else "stiffer springs, less force, pads that touch"
     yield Check("stability", state, found, remedy)
+    answer = float(lin.normal_force_sensitivity.abs().max())
+    if answer > _CONTRADICT:
+        found = f"rigid actuators contradict each other: {answer:.1g} N/rad"
+        yield Check("actuators in the pinch", "warning", found, "give them their true 'stiffness'")
     relative = lin.forces.relative_margin
     found = ", ".join(f"{n} {v:.2f}" for n, v in zip(lin.contacts.finger, relative.tolist(), strict=True))
     low = bool(relative.min() < _LOW_MARGIN)
@@ -321,6 +326,16 @@ def _grasp(hand: HandDescription, lin: Linearization) -> Iterator[Check]:
     if stopped:
         found = f"a stop holds: {', '.join(stopped)}"
         yield Check("stops", "warning", found, "wider limits, stiffer springs")
+    upstream = HandKinematics(hand).upstream.numpy()
+    used = upstream[[hand.link_names.index(link) for link in lin.contacts.link]].any(axis=0)
+    slack = [
+        actuator.name
+        for actuator, arms, lam in zip(hand.actuators, hand.actuation_jacobian, lin.forces.lam, strict=True)
+        if actuator.tendon and arms[used].any() and -float(lam) <= 1e-4
+    ]
+    if slack:
+        remedy = "stiffer springs or other rest angles"
+        yield Check("tendons in the pinch", "warning", f"slack: {', '.join(slack)}", remedy)
 
 
 def _draw(

@@ -12,7 +12,8 @@ import numpy as np
 
 from ...control import StopReason
 from ...description import load_hand, load_object
-from ...rendering import Captions, make_scene, save_animation
+from ...exceptions import EKMError
+from ...rendering import Captions, make_scene, save_animation, save_picture
 from ..config import digest
 from ..records import TrialRecord
 from ..reporting.plots import plot_prediction_error, save_figure
@@ -96,7 +97,7 @@ class Demo(Generalize):
         return figures
 
     def _pictures(self, turns: DataFrame, folder: Path) -> list[FigureFile]:
-        """The E-KM's best long turn as an animation."""
+        """The E-KM's best long turn: before and after, and as an animation."""
         mine = select(turns, controller="E-KM", lost=False)
         mine = mine[mine["poses"].map(len) > 0]
         if mine.empty:
@@ -114,7 +115,13 @@ class Demo(Generalize):
             f"{hand.name} turns {obj.name}: E-KM", lines, turn.angle_deg - left, target=turn.angle_deg
         )
         save_animation(scene, folder / "animation.html", captions, seconds=0.5)
-        return [FigureFile("animation.html", f"A turn of {what}, motion by motion: drag to look around.")]
+        moving = FigureFile("animation.html", f"A turn of {what}, motion by motion: drag to look around.")
+        try:
+            save_picture(scene, folder / "hand.png", frames=(0, -1))
+        except EKMError:  # a machine that cannot draw; the animation needs a browser alone
+            return [moving]
+        caption = f"The {_spoken(self.object)} before and after a turn of {what}, seen along the axis."
+        return [FigureFile("hand.png", caption), moving]
 
 
 def new_table(trials: DataFrame) -> Table:
