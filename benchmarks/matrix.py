@@ -211,8 +211,6 @@ FIGURES: dict[str, Measure] = {
     "shift [mm]": Measure(lambda t: _median(t["wrong_mm"])),
     "farthest [deg]": Measure(lambda t: _median(t["largest"]), ".1f"),
     "predicted end off by [deg]": Measure(lambda t: _median((t["reach"] - t["largest"]).abs()), ".1f"),
-    "estimate off by [deg]": Measure(lambda t: _median(t["estimate"].where(t["part"].str[:5] == "blind"))),
-    "stated sd [deg]": Measure(lambda t: _median(t["sd"])),
     "along the grip, last [mm]": Measure(lambda t: _mean(_last(t)["shift"])),
     "contacts slid, last [mm]": Measure(lambda t: _mean(_last(t)["slid"])),
 }  # fmt: skip

@@ -130,14 +130,11 @@ _ASKED = (
         short={"learns_by": (), "groups": ("shift 3 mm",)},
     ),
     Question(
-        "foresight", "How far a grasp turns, whether that is predicted, and turns without the camera",
+        "foresight", "How far a grasp turns, and whether that is predicted",
         foresight, ORACLE, objects=("box", "weighted_box", "can", "bottle", "applier", "tea_tin", "jar"),
-        setting=Setting(), options={"learns_by": (15.0, 15.0, 15.0), "far": 70.0, "blind": 15.0}, by="case",
-        columns=(
-            "turns", "lost", "reached", "farthest [deg]", "predicted end off by [deg]",
-            "estimate off by [deg]", "stated sd [deg]",
-        ),
-        split="object", short={"learns_by": (), "far": 6.0, "blind": 5.0},
+        setting=Setting(), options={"learns_by": (15.0, 15.0, 15.0), "far": 70.0},
+        columns=("turns", "lost", "reached", "farthest [deg]", "predicted end off by [deg]"),
+        split="object", short={"learns_by": (), "far": 6.0},
         picture=points("largest", "reach - largest", "farthest turn [deg]", "predicted end less that [deg]"),
     ),
     Question(

@@ -23,7 +23,7 @@ from torch_ekm.typing import Tensor
 
 _DEG = math.pi / 180
 _SI = {"deg": _DEG, "mm": 1e-3}
-_FAR, _BLIND = 3000, 4000  # numbers of the grasps of the turns that go as far as they can, and blind
+_FAR = 3000  # number of the grasp of the turn that goes as far as it can
 _LEAST_ASKED = 0.01 * _DEG  # of a motor that is to move
 _MADE = 0.8  # of a movement: one that was ended on its way says nothing of the band at its end
 Make = Callable[[str], Bench]
@@ -244,29 +244,23 @@ def directions(
 
 
 def foresight(
-    make: Make, items: Sequence[str], seed: int, *, learns_by: Sequence[float], far: float, blind: float
+    make: Make, items: Sequence[str], seed: int, *, learns_by: Sequence[float], far: float
 ) -> list[TrialRecord]:
-    """Turns without the camera, by touch and by prediction; then as far as the grasp goes, predicted."""
+    """A turn as far as the grasp goes, and what was predicted of it."""
     bench, made = _warmed(make, items[0], seed, learns_by), []
-    dark = {"blind, by touch": True, "blind, prediction alone": False}
-    ways = {part: {"learn": False, "touch": touch} for part, touch in dark.items() if bench.learns}
-    for part, options in {**ways, "as far as it goes": {}}.items():
-        start = bench.grasp(seed, _BLIND if options else _FAR)
-        about = Trial(bench.name, "turn", bench.controller, seed, _FAR, blind if options else far)
-        if start is None:
-            missed = TrialRecord(**vars(about), reason=NOT_GRASPED, message=bench.no_grasp)
-            made.append(row(missed, part=part))
-            continue
-        reach, ends = (math.nan, "") if options else _reach(bench, far)
-        record = bench.turn(about, start, **options)
+    start = bench.grasp(seed, _FAR)
+    about = Trial(bench.name, "turn", bench.controller, seed, _FAR, far)
+    if start is None:
+        made.append(row(TrialRecord(**vars(about), reason=NOT_GRASPED, message=bench.no_grasp)))
+    else:
+        reach, ends = _reach(bench, far)
+        record = bench.turn(about, start)
         assert bench.last is not None
-        axis, last = bench.hand.rotation_axis, bench.last.stop.final
-        seen = [*(step.before for step in bench.last.steps), last]
+        axis = bench.hand.rotation_axis
+        seen = [*(step.before for step in bench.last.steps), bench.last.stop.final]
         held = [true_state(at) for at in (seen[:-1] if record.lost and len(seen) > 1 else seen)]
         largest = max(float(axis @ at.minus(held[0])[-3:]) for at in held) / _DEG
-        sd = last.info.get("estimate", {}).get("axis_std", math.nan) / _DEG
-        off = abs(float(axis @ last.state.minus(true_state(last))[-3:])) / _DEG
-        made.append(row(record, part=part, largest=largest, reach=reach, ends=ends, estimate=off, sd=sd))
+        made.append(row(record, largest=largest, reach=reach, ends=ends))
     bench.close()
     return made
 

@@ -41,16 +41,11 @@ class Noise:
     """Share by which moment arms are not as described."""
     gap: float = 1e-4
     """Of the gap of a pad that presses [m]: what the object's pose and both shapes leave open."""
-    slip: float = 0.05
-    """Share of the way of a rolling contact that it slides."""
     share: float = 0.08
     """Of a motion, what a model leaves that learns its figures, or f + g on top of what g states. With 0.12 a
     tendon that is replaced is no surprise."""
     described: float = 0.3
     """The same of a model as described, which states nothing."""
-    joint_motion: float = 0.5
-    """Of a joint's predicted motion, as a share of the largest of an actuator: a model with tendons of
-    another radius predicts joints badly."""
     force: float = 0.3
     """Of a measured normal force, or of a change of it that is predicted [N]."""
     pressing: float = 0.5
@@ -61,8 +56,6 @@ class Noise:
     """By which a contact force leaves its prediction in each motion, per axis [N]."""
     force_share: float = 0.3
     """The same as a share of the predicted change; both add up."""
-    friction: float = 0.05
-    """Of friction coefficients, relative."""
     outlier: float = 4.0
     """So many deviations off, an observation is none of what is estimated."""
     furthest: float = 5.0

@@ -15,7 +15,6 @@ import numpy as np
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
 from torch_ekm.experiments.learners import LEARNERS
-from torch_ekm.model.calibration import Calibration
 from torch_ekm.typing import Array
 
 from .fingers import FingerMarkers, identify_markers
@@ -23,7 +22,6 @@ from .learning import adapting_predictions, learned_predictions
 from .nominal import (
     NOMINALS,
     Samples,
-    calibrate_hand,
     jacobians,
     predictions,
     take_samples,
@@ -38,7 +36,7 @@ HAND = "yale_t42"
 HORIZONS = (10, 50)
 """[steps of 0.1 s] at which learners are scored, too."""
 LEARNER = "SOGP mixture"
-_LEARNED = [nominal for nominal in NOMINALS if nominal.kind in ("none", "calibrated", "online")]
+_LEARNED = [nominal for nominal in NOMINALS if nominal.kind in ("none", "online")]
 
 Predicted = dict[str, Array]
 
@@ -55,8 +53,6 @@ class RecordedHandResult:
     """By name of the predictor and horizon; "NAME + LEARNER" where there is a learner."""
     rows: list[Row]
     markers: FingerMarkers
-    calibration: Calibration
-    """Found on the recording set apart."""
 
     @property
     def reported(self) -> list[str]:
@@ -74,8 +70,8 @@ def predict_recorded_hand(
     """Predict the recorded motions of the Yale T42, ten and fifty steps ahead, with every nominal model.
 
     Everything is causal: camera, sizes of objects and states come from frames up to the moment of prediction,
-    and learners see a motion when it is over. Markers and calibration are identified on one recording set
-    apart, which is not scored.
+    and learners see a motion when it is over. Markers are identified on one recording set apart, which is not
+    scored.
 
     Args:
         data: ``t42_testpaths.npz`` or the folder that holds it, read in place. None: a small synthetic one,
@@ -104,25 +100,21 @@ def predict_recorded_hand(
     markers = identify_markers(hand, seen, pose, diameter)
     each = {name: (name, own, markers, hand) for name, own in paths.items()}
     states: dict[str, States] = _at_once(processes, estimate_states, each)
-    calibration = calibrate_hand(hand, apart, states[APART], diameter)
-    by_state = {
-        "published": {name: jacobians(hand, own, rigid=True) for name, own in states.items()},
-        "calibrated": {name: jacobians(calibration.hand, own, rigid=False) for name, own in states.items()},
-    }
+    published = {name: jacobians(hand, own) for name, own in states.items()}
     moved = {name: through_play(own, hand) for name, own in paths.items()}
     samples = {
         horizon: {name: take_samples(own, states[name], moved[name], horizon) for name, own in paths.items()}
         for horizon in HORIZONS
     }
     predicted = {
-        (nominal.name, horizon): predictions(nominal, taken, by_state, APART)
+        (nominal.name, horizon): predictions(nominal, taken, published, APART)
         for horizon, taken in samples.items()
         for nominal in NOMINALS
         if nominal.kind != "online"
     }
     order = sorted(name for name in states if name != APART)
     (online,) = (nominal.name for nominal in NOMINALS if nominal.kind == "online")
-    adapting = states, by_state["published"], [APART, *order]
+    adapting = states, published, [APART, *order]
     jobs: dict[Any, Any] = {(online, horizon): (hand, samples[horizon], *adapting) for horizon in HORIZONS}
     predicted |= _at_once(processes, adapting_predictions, jobs)
     limit = 40 if quick else None
@@ -138,7 +130,7 @@ def predict_recorded_hand(
         taken = {key: samples[horizon][key] for key in order}
         unit = samples[horizon][APART].motion.std(axis=0)
         rows.append(score(name, horizon, taken, own, unit))
-    return RecordedHandResult(paths, states, samples, predicted, rows, markers, calibration)
+    return RecordedHandResult(paths, states, samples, predicted, rows, markers)
 
 
 def _at_once(

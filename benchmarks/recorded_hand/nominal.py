@@ -14,18 +14,12 @@ from numpy.typing import NDArray
 from torch_ekm.description import HandDescription
 from torch_ekm.kinematics.servo_model import Play
 from torch_ekm.model import KinematicModel
-from torch_ekm.model.calibration import Calibration, calibrate
-from torch_ekm.plant import Observation, PlantStatus, Trajectory
 from torch_ekm.typing import Array
 
 from .fingers import rotation
 from .recordings import RecordedPath
-from .states import OPTIONS, STRIDE, States, cylinder
+from .states import OPTIONS, States, cylinder
 
-CALIBRATED = ("springs", "moment_arms", "stiffness")
-"""Kinds of figures that are calibrated: chosen by halves of the recording set apart."""
-EVERY = 5
-"""States between two that the calibration takes for rests: 5 s."""
 LARGEST = 0.2  # [m/rad]: a Jacobian five times that of the hand's middle is not believed
 
 
@@ -35,7 +29,7 @@ class Nominal:
 
     name: str
     kind: str
-    """"none", "constant", "published", "calibrated" or "online" (learning.py)."""
+    """"none", "constant", "published" or "online" (learning.py)."""
     play: bool = False
     """Whether the motors' motion goes through the play of the drive first."""
 
@@ -45,7 +39,6 @@ NOMINALS = (
     Nominal("constant Jacobian, play", "constant", play=True),
     Nominal("KM, published figures", "published"),
     Nominal("KM, published figures, play", "published", play=True),
-    Nominal("KM, calibrated, play", "calibrated", play=True),
     Nominal("KM, figures online, play", "online", play=True),
 )
 
@@ -109,15 +102,11 @@ def take_samples(
     return Samples(*(np.array(column) for column in zip(*rows, strict=True)), horizon)
 
 
-def jacobians(hand: HandDescription, states: States, *, rigid: bool) -> Array:
-    """``d(x, y, angle)/da`` at each state, camera axes ``(n, 3, 2)``.
-
-    Args:
-        hand: its springs, moment arms and stiffnesses.
-        rigid: without the stiffness of tendon and servo, which is not published.
-    """
+def jacobians(hand: HandDescription, states: States) -> Array:
+    """``d(x, y, angle)/da`` at each state, camera axes ``(n, 3, 2)``; stiffnesses of tendon and servo are not
+    published, and taken for rigid."""
     obj = cylinder(0.045)  # its mass alone counts, and that not in the plane
-    model = KinematicModel(hand, obj, dataclasses.replace(OPTIONS, actuator_compliance=not rigid))
+    model = KinematicModel(hand, obj, dataclasses.replace(OPTIONS, actuator_compliance=False))
     linear = model.linearize(states.grasps(), states.contact_set(obj.friction))
     J = linear.object_jacobian[:, [0, 1, 5]].numpy()
     believed = np.abs(J[:, :2]).max((1, 2)) < LARGEST
@@ -134,13 +123,13 @@ def constant_jacobian(action: Array, motion: Array) -> Array:
 def predictions(
     nominal: Nominal,
     samples: Mapping[str, Samples],
-    by_state: Mapping[str, Mapping[str, Array]],
+    published: Mapping[str, Array],
     apart: str,
 ) -> dict[str, Array]:
     """Of each object, ``(n, 3)`` [m, m, rad].
 
     Args:
-        by_state: Jacobians of each kind of KM, of each object.
+        published: Jacobians of the KM at the states of each object.
         apart: object that a constant Jacobian is fitted to.
     """
     found = {}
@@ -149,8 +138,8 @@ def predictions(
         if nominal.kind == "none":
             found[name] = np.zeros_like(taken.motion)
             continue
-        if nominal.kind in by_state:
-            J = by_state[nominal.kind][name][taken.row]
+        if nominal.kind == "published":
+            J = published[name][taken.row]
         else:
             fitted = samples[apart]
             J = constant_jacobian(action_of(nominal, fitted), fitted.motion)
@@ -161,25 +150,3 @@ def predictions(
 def action_of(nominal: Nominal, samples: Samples) -> Array:
     """What the model takes for the motion of the tendons."""
     return samples.transmitted if nominal.play else samples.delta_a
-
-
-def calibrate_hand(
-    hand: HandDescription, paths: Sequence[RecordedPath], states: States, diameter: float
-) -> Calibration:
-    """Springs, moment arms and stiffnesses from the recording set apart, a cylinder of known diameter."""
-    recordings, grasps = [], states.grasps()
-    for number, path in enumerate(paths):
-        a = torch.from_numpy(np.concatenate([np.zeros((1, 2)), np.cumsum(path.delta_a, axis=0)]))
-        own = np.flatnonzero((states.path == number) & (states.step % (EVERY * STRIDE) == 0))
-        rests = [
-            Observation(
-                grasps.q[k],
-                a[states.step[k]],
-                grasps.position[k],
-                grasps.rotation[k],
-                status=PlantStatus.HELD if states.found[k] else PlantStatus.NOT_SEEN,
-            )
-            for k in own
-        ]
-        recordings.append(Trajectory(observations=rests))
-    return calibrate(KinematicModel(hand, cylinder(diameter), OPTIONS), recordings, CALIBRATED)

@@ -76,7 +76,7 @@ def write_report(result: RecordedHandResult, folder: str | Path) -> Report:
         "Error of the position over its motion, and 95 % intervals over objects; 1: as if nothing moved."
     )
     dots = save_figure(dot_chart(tables[:1], ["x", "y"], "error / motion"), Path(folder), "scores", caption)
-    configuration = {"apart": APART, "objects": result.reported, "calibration": str(result.calibration)}
+    configuration = {"apart": APART, "objects": result.reported}
     title = "Recorded motions of a Yale T42, predicted"
     report = Report(title, summary(result), tables, [dots], configuration=configuration)
     report.write(Path(folder))

@@ -167,7 +167,7 @@ def test_predictions_use_nothing_of_the_future(folder, result):
 def test_a_learner_sees_each_sample_after_its_prediction(result):
     """The first sample is the model's own; later ones differ; nothing is learned of the object set apart."""
     name = sorted(result.reported)[0]
-    for nominal in ("no model", "KM, calibrated, play", "KM, figures online, play"):
+    for nominal in ("no model", "KM, figures online, play"):
         alone, learned = (result.predicted[key, 50][name] for key in (nominal, f"{nominal} + linear RLS"))
         np.testing.assert_array_equal(learned[0], alone[0])
         assert not np.array_equal(learned[2:], alone[2:])

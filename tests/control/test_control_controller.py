@@ -101,7 +101,7 @@ def test_forces_are_those_that_fingertips_and_the_last_decision_speak_for(grasp)
     expected = first.linearization.forces_after(moved - seen.a)
     alone = model.linearize(state, fingertip_force=seen.fingertip_force, expected=expected)
     assert torch.equal(second.forces.mu, alone.forces.mu)
-    assert torch.equal(second.forces.margin_std, alone.forces.margin_std)
+    assert torch.equal(second.forces.covariance, alone.forces.covariance)
     assert not torch.allclose(second.forces.mu, first.linearization.forces.mu, atol=1e-3)
     loop.reset()
     again = loop.decide(state, seen.a, target, seen.fingertip_force).linearization

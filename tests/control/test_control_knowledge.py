@@ -113,10 +113,8 @@ IMPOSSIBLE = {  # entry, an index, and a value that no estimator comes to
     "evidence": ("forces.evidence", (0, 1, 1), -1.0),
     "endless evidence": ("forces.evidence", (0, 1, 1), 1e300),
     "figures": ("figures.mean", 0, 5.1),
-    "figures before": ("figures.before", 0, -5.1),
     "covariance of figures": ("figures.covariance", (0, 0), 1e3),
     "usual": ("figures.usual", (), 1e30),
-    "change": ("figures.changed_at", (), 10_000),
     "error": ("error.square", 0, 1.1),
     "error below 0": ("error.square", 1, -0.1),
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -56,7 +55,9 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(pinch) -> 
     carried = 10e-3 * focus.off_matrix[focus.off_translation][0]
     shares = [share(off=carried, asked=asked) for asked in (0.3, 0.5, 1.0, 2.0)]
     assert shares == pytest.approx([1.0, 0.7, 0.35, 0.25])  # none below 0.35 of the largest step
-    slides = -lin.margin_sensitivity[0]
+    still = torch.zeros(plant.hand.n_a, dtype=torch.float64)
+    slopes = torch.autograd.functional.jacobian(lin.margins_after, still)  # [N/rad]
+    slides = -slopes[0]
     slides *= 40.0 / float(slides.square().sum())  # [N] that the margin falls by
     assert share(slides, asked=2.0) < 1.0
     grips = [firm._replace(wanted=wanted) for wanted in (1 / 1.2, 1 / 0.75, 1 / 0.65, 1 / 0.55, 1 / 0.3, 0.0)]
@@ -65,7 +66,7 @@ def test_a_step_is_cut_in_proportion_to_what_is_predicted_to_go_wrong(pinch) -> 
     felt = dataclasses.replace(at, fingertip_force=seen.fingertip_force)
     assert [share(seen=one, grip=grips[3]) for one in (at, felt)] == [0.35, 0.0]  # an estimate does not wait
     # a motion that takes the margins away: the heavier the object, the less of it is made
-    delta = 4 * DEG * torch.from_numpy(np.sign(lin.margin_sensitivity.sum(0).numpy())) * -1.0
+    delta = 4 * DEG * -torch.sign(slopes.sum(0))
     heavier = [dataclasses.replace(at, weight=weight) for weight in (0.3, 3.0)]
     shares = [share(delta, asked=10.0, seen=one) for one in heavier]
     assert 0 < shares[1] < shares[0] < 1

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from torch_ekm.description import list_hands, load_hand, write_template
+from torch_ekm.description import list_hands, load_hand, write_template, write_transmission
 from torch_ekm.description.registry import hand_paths
 from torch_ekm.description.urdf import read_urdf
 from torch_ekm.exceptions import DescriptionError, UnknownNameError
@@ -145,3 +147,30 @@ def test_what_no_template_is_written_for(tmp_path: Path) -> None:
     (tmp_path / "thing.urdf").write_text('<robot name="thing"><link name="thing"/></robot>')
     with pytest.raises(DescriptionError, match="no revolute or continuous joint"):
         write_template(tmp_path / "thing.urdf")
+
+
+@pytest.mark.parametrize("name", ["icub_right", "planar_two_finger"])
+def test_a_written_transmission_reads_back(name, tmp_path):
+    hand = load_hand(name)
+    actuators = tuple(
+        dataclasses.replace(actuator, stiffness=1.0 + k, backlash=0.01 * k, offset=0.1 * k)
+        for k, actuator in enumerate(hand.actuators)
+    )
+    changed = dataclasses.replace(
+        hand,
+        actuators=actuators,
+        actuation_jacobian=1.1 * hand.actuation_jacobian,
+        spring_stiffness=0.9 * hand.spring_stiffness,
+        spring_rest=hand.spring_rest - 0.1,
+    )
+    write_transmission(changed, tmp_path / "mine.transmission.toml")
+    back = load_hand(tmp_path / "mine.urdf")
+    assert back.actuators == changed.actuators
+    for field in dataclasses.fields(changed):
+        one, other = getattr(changed, field.name), getattr(back, field.name)
+        if isinstance(one, np.ndarray):
+            np.testing.assert_array_equal(one, other)
+        elif field.name not in ("urdf", "transmission_path"):
+            assert one == other, field.name
+    with pytest.raises(DescriptionError, match="end in"):
+        write_transmission(changed, tmp_path / "mine.toml")

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-import pytest
 import torch
 from model_icub import gripped
-from model_toys import F64, select, soft_two_finger, three_finger
+from model_toys import F64, select
 
 from torch_ekm.kinematics import GraspState
-from torch_ekm.model.grasp_forces import friction_use, margin_std
 
 
 def noisy(state: GraspState, seed: int) -> GraspState:
@@ -51,47 +49,19 @@ def test_forces_follow_the_prediction_over_a_motion():
     assert torch.allclose(after.margin, true.margin, atol=2e-3)
     estimated = model.linearize(end.state, end.contacts, expected=after).forces
     assert float((estimated.force - true.force).norm()) < 5e-3
-    assert torch.equal(estimated.margin_std > 0, torch.ones(3, dtype=torch.bool))
 
 
-@pytest.mark.parametrize("make", [three_finger, soft_two_finger])
-def test_the_margins_deviation_is_that_of_forces_drawn_from_the_covariance(make):
-    toy = make()
-    n_c = toy.contacts.n_c
-    contacts = toy.contacts.replace(friction=torch.full((n_c,), 0.3, dtype=F64))  # friction counts, too
-    forces, draw = toy.forces(), torch.Generator().manual_seed(0)
-    half = 1e-3 * torch.randn(4 * n_c, 4 * n_c, generator=draw, dtype=F64)
-    half[3::4] *= 0.03  # moments
-    mean = torch.cat([forces.force, forces.spin_moment[:, None]], -1).flatten()
-    drawn = mean + torch.randn(8000, 4 * n_c, generator=draw, dtype=F64) @ half.mT
-    drawn = drawn.unflatten(-1, (n_c, 4))
-    n_in, mu_s = -contacts.normal, contacts.friction
-    normal = (drawn[..., :3] * n_in).sum(-1)
-    across = drawn[..., :3] - normal[..., None] * n_in
-    spin = torch.zeros_like(normal)
-    if make is soft_two_finger:
-        spin = drawn[..., 3] * mu_s / contacts.torsional_friction
-    margin = mu_s * normal - (across.square().sum(-1) + spin.square()).sqrt()
-    f_n, now, gradient = friction_use(contacts, forces.force, forces.spin_moment, contacts.normal)
-    of_friction = 0.05 * 0.3 * f_n
-    std = margin_std(contacts, f_n, gradient, half @ half.mT)
-    assert torch.allclose(margin.mean(0), now, atol=1e-3)
-    assert torch.allclose((margin.var(0) + of_friction.square()).sqrt(), std, rtol=0.05)
-    certain = margin_std(contacts, f_n, gradient, 0 * half)
-    assert torch.allclose(certain, of_friction.abs())
-
-
-def test_fingertips_make_the_margins_surer():
+def test_fingertips_make_the_forces_surer():
     model, at, exact = icub()
     nothing = exact.forces_after(torch.zeros(9, dtype=F64))
     tips = torch.full((5,), torch.nan, dtype=F64)
     tips[:3] = exact.forces.normal
     told = ({}, {"fingertip_force": tips})
-    std = [
-        model.linearize(at.state, at.contacts, expected=nothing, **what).forces.margin_std for what in told
+    sure = [
+        model.linearize(at.state, at.contacts, expected=nothing, **what).forces.covariance for what in told
     ]
-    assert (std[1] < std[0]).all()
-    assert model.linearize(at.state, at.contacts).forces.margin_std is None  # a choice, not an estimate
+    assert float(sure[1].trace()) < float(sure[0].trace())
+    assert model.linearize(at.state, at.contacts).forces.covariance is None  # a choice, not an estimate
 
 
 def test_a_contact_that_was_not_expected_joins_in(toy):
@@ -106,7 +76,6 @@ def test_a_contact_that_was_not_expected_joins_in(toy):
         normal=expected.normal[[0, 2]],
         margin=expected.margin[[0, 2]],
         covariance=expected.covariance[:8, :8],
-        margin_std=expected.margin_std[[0, 2]],
     )
     forces = toy.model.linearize(toy.state, expected=two).forces
     assert float((forces.force - lin.forces.force).norm()) < 0.2 * float(lin.forces.force.norm())

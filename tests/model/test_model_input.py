@@ -205,7 +205,7 @@ def test_states_of_a_batch_have_their_own_slack_tendons():
     wide = {
         f.name: getattr(forces, f.name).expand(2, *getattr(forces, f.name).shape)
         for f in dataclasses.fields(forces)
-        if f.name not in ("status", "lam", "covariance", "margin_std")
+        if f.name not in ("status", "lam", "covariance")
     }
     both = dataclasses.replace(forces, lam=lam, status=forces.status * 2, **wide)
     states, contacts = batch_of(toy.state, toy.state), stacked(toy.contacts, toy.contacts)

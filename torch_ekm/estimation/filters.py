@@ -138,11 +138,6 @@ class ParameterFilter(Recorded, nn.Module):
         """u."""
         self.surprises = nn.Buffer(torch.zeros((), dtype=torch.int64))
         """Surprising motions in succession."""
-        self.changed_at = nn.Buffer(torch.full((), -1, dtype=torch.int64))
-        """Count at the last change; -1: there was none."""
-        self.before = nn.Buffer(self.mean.clone())
-        """m before the last change."""
-        self.before_covariance = nn.Buffer(covariance.clone())
 
     def __len__(self) -> int:
         return len(self.names)
@@ -190,9 +185,6 @@ class ParameterFilter(Recorded, nn.Module):
         self.usual += _RECENT * (min(z, most) - self.usual)
         self.surprises.copy_(self.surprises + 1 if z > most else torch.zeros_like(self.surprises))
         if int(self.surprises) >= _IN_A_ROW:
-            self.before.copy_(self.mean)
-            self.before_covariance.copy_(self.covariance)
-            self.changed_at.copy_(self.count)
             self.surprises.zero_()
             P = P_0
         weight = min(1.0, most / z) if z > 0 else 1.0
@@ -206,17 +198,14 @@ class ParameterFilter(Recorded, nn.Module):
 
     def state_problems(self, state: Mapping[str, Any]) -> list[str]:
         """What is wrong with the entries of a state that is to be loaded."""
-        count, wrong = int(state["count"]), []
-        for name in ("covariance", "before_covariance"):
-            wrong += covariance_problems(name, state[name], self.prior.diagonal())
-        for name in ("mean", "before"):
-            if bool(((state[name] < self.lower) | (state[name] > self.upper)).any()):
-                wrong.append(f"{name} is out of bounds")
-        if not count and not torch.equal(state["mean"], self.start.to(state["mean"])):
+        count, mean = int(state["count"]), state["mean"]
+        wrong = covariance_problems("covariance", state["covariance"], self.prior.diagonal())
+        if bool(((mean < self.lower) | (mean > self.upper)).any()):
+            wrong.append("mean is out of bounds")
+        if not count and not torch.equal(mean, self.start.to(mean)):
             wrong.append("mean is not the start, and no motion was learned")
         most = (1 + _RECENT * (_SURPRISE - 1)) ** min(count, 5000)  # of so many surprises in succession
-        surprises = 0, _IN_A_ROW - 1
-        return wrong + bound_problems(state, usual=(0, most), surprises=surprises, changed_at=(-1, count))
+        return wrong + bound_problems(state, usual=(0, most), surprises=(0, _IN_A_ROW - 1))
 
     def extra_repr(self) -> str:
         return f"parameters={len(self)}, motions={int(self.count)}"

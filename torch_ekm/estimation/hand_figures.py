@@ -15,17 +15,19 @@ from .._checks import check_finite, check_kind, check_shape
 from .._noise import NOISE
 from .._recorded import Recorded
 from ..description import HandDescription
-from ..exceptions import GraspError, StateError
+from ..exceptions import GraspError, ParameterError, StateError
 from ..kinematics.servo_model import Play, PlayState
 from ..model import Linearization
-from ..model.calibration.parameters import PRIORS, Parameter, Unknowns
 from ..model.linearization import Motion, MotionEquations
 from ..model.reduction import Drives
 from ..typing import Array, Float, Tensor
 from .filters import ParameterFilter
 
-KINDS = ("springs", "moment_arms", "stiffness", "backlash")
-# of the prior, in units of those of the calibration: one lathe turns all pulleys, one cable strings them
+# how far off each kind may well be: of the logarithm, and of play [rad]
+_PRIORS = {"springs": 0.5, "moment_arms": NOISE.arm, "stiffness": 0.7, "backlash": math.radians(1)}
+KINDS = tuple(_PRIORS)
+_WORDS = {"springs": "spring", "moment_arms": "moment arm"}  # else the kind itself
+# of the prior, in its units: one lathe turns all pulleys, one cable strings them
 _COMMON, _OWN = 1.0, 0.4
 _PLAY = 0.5  # of the prior of a backlash: its width where none is described, and how sure it is
 _IDENTIFIED = 0.7  # of the variance of a figure of its kind without observations
@@ -47,16 +49,34 @@ class Figure(NamedTuple):
     """It is a backlash."""
 
 
-class Change(NamedTuple):
-    """A figure that changed while the hand worked."""
+class _Entry(NamedTuple):
+    """A figure as the description has it."""
 
+    kind: str
     name: str
-    motion: int
-    """After how many motions."""
-    factor: float
-    """Of its former value."""
-    z: float
-    """Standard deviations that it moved."""
+    index: tuple[int, ...]
+    """Where it stands in the hand's array of its kind."""
+    nominal: float
+
+    @property
+    def label(self) -> str:
+        """What it is called in tables and messages."""
+        return f"{_WORDS.get(self.kind, self.kind)} of {self.name}"
+
+
+def _entries(hand: HandDescription) -> list[_Entry]:
+    """What may be learned of a hand. Motors that only shape it (``posture``) rest while an object moves."""
+    motors = [k for k, motor in enumerate(hand.actuators) if not motor.posture]
+    arms, joints, names = hand.actuation_jacobian, hand.joint_names, hand.actuator_names
+    of_arms = [(k, j) for k, j in np.argwhere(arms != 0).tolist() if k in motors]
+    found = [_Entry("springs", one, (j,), float(hand.spring_stiffness[j])) for j, one in enumerate(joints)]
+    found += [
+        _Entry("moment_arms", f"{names[k]} at {joints[j]}", (k, j), float(arms[k, j])) for k, j in of_arms
+    ]
+    found += [_Entry("stiffness", names[k], (k,), float(hand.actuators[k].stiffness)) for k in motors]
+    # a spring that is not there and a motor that is rigid have no logarithm
+    found = [one for one in found if one.nominal != 0 and math.isfinite(one.nominal)]
+    return found + [_Entry("backlash", names[k], (k,), float(hand.actuators[k].backlash)) for k in motors]
 
 
 class DescribedFigures(Recorded, nn.Module):
@@ -124,23 +144,23 @@ class HandFigures(ParameterFilter):
     learns = True
 
     def __init__(self, hand: str, entries: Sequence[Sequence[Any]]) -> None:
-        found = [
-            Parameter(kind, name, tuple(index), value, PRIORS[kind]) for kind, name, index, value in entries
-        ]
+        found = [_Entry(kind, name, tuple(index), value) for kind, name, index, value in entries]
         kind = torch.tensor([KINDS.index(one.kind) for one in found])
         prior = _COMMON**2 * (kind[:, None] == kind).double() + _OWN**2 * torch.eye(len(found)).double()
-        play = torch.tensor([not one.logarithmic for one in found])
+        play, std = kind == KINDS.index("backlash"), np.array([_PRIORS[one.kind] for one in found])
+        described = np.array([one.nominal for one in found])
         scale = torch.where(play, _PLAY, 1.0).double()
-        start = [_PLAY * (not one.logarithmic and one.nominal == 0) for one in found]
-        lower, upper = [one.lowest for one in found], [NOISE.furthest] * len(found)
+        start = _PLAY * (play & torch.from_numpy(described == 0))
+        # play is not negative
+        lower = (-np.where(play, np.minimum(NOISE.furthest, described / std), NOISE.furthest)).tolist()
+        upper = [NOISE.furthest] * len(found)
         super().__init__([one.label for one in found], start, scale[:, None] * prior * scale, lower, upper)
         self._is_play, self._unit = play.numpy(), Play(torch.full((int(play.sum()),), 2.0).double())
         self._play: PlayState | None = None  # in units of half the widths
         self._a = torch.empty(0)  # encoders at the last commit
         self._solved: tuple[MotionEquations | None, Array, Motion | None] = None, np.empty(0), None
         self.hand, self._entries, self._kind = hand, tuple(found), kind.numpy()
-        self._described = np.array([one.nominal for one in found])
-        self._prior_std = np.array([one.prior for one in found])
+        self._described, self._prior_std = described, std
         self._at = [  # where the figures of each kind stand in its array
             tuple(map(np.array, zip(*(one.index for one in found if one.kind == name), strict=True)))
             for name in KINDS
@@ -154,8 +174,10 @@ class HandFigures(ParameterFilter):
         Raises:
             ParameterError: the hand has no springs, moment arms or stiffnesses.
         """
-        found = Unknowns(hand, KINDS).parameters
-        return cls(hand.name, [(one.kind, one.name, one.index, one.nominal) for one in found])
+        found = _entries(hand)
+        if not found:
+            raise ParameterError("hand", hand.name, "one with springs, moment arms or stiffnesses")
+        return cls(hand.name, [tuple(one) for one in found])
 
     def check(self, hand: HandDescription) -> None:
         """That they are of this hand.
@@ -164,7 +186,7 @@ class HandFigures(ParameterFilter):
             StateError: another hand's, or its description has other figures.
         """
         ours = {one.label: one.nominal for one in self._entries}
-        theirs = {one.label: one.nominal for one in Unknowns(hand, KINDS).parameters}
+        theirs = {one.label: one.nominal for one in _entries(hand)}
         other = [name for name in {**ours, **theirs} if ours.get(name) != theirs.get(name)]
         if other:
             had, has = (figures.get(other[0], "no such figure") for figures in (ours, theirs))
@@ -360,20 +382,6 @@ class HandFigures(ParameterFilter):
                 identified[own] = variance[own] < _IDENTIFIED * (common.clamp(min=0.0) + alone)
         return identified
 
-    @property
-    def changes(self) -> tuple[Change, ...]:
-        """What changed at the last change, by more than two standard deviations; most certain first."""
-        if self.changed_at < 0:
-            return ()
-        step = self.mean - self.before
-        z = step / (self.covariance.diagonal() + self.before_covariance.diagonal()).sqrt()
-        factor, at = np.exp(self._prior_std * step.numpy()), int(self.changed_at)
-        found = [
-            Change(self.names[i], at, float(factor[i]), float(z[i]))
-            for i in ((z.abs() > 2) & torch.from_numpy(~self._is_play)).nonzero()[:, 0].tolist()
-        ]
-        return tuple(sorted(found, key=lambda one: -abs(one.z)))
-
     def __str__(self) -> str:
         figures = self.figures
         lines = [
@@ -386,10 +394,6 @@ class HandFigures(ParameterFilter):
         rest = [one.name for one in figures if not one.identified]
         if rest:
             lines.append(f"not identified: {', '.join(rest)}")
-        lines += [
-            f"{one.name}: changed after {one.motion} motions, to {one.factor:.2f} times its value"
-            for one in self.changes
-        ]
         return "\n".join(lines)
 
 

@@ -23,7 +23,6 @@ from ..description import ObjectDescription
 from ..enhanced import EnhancedModel, GraspEncoding
 from ..enhanced.grasp import SMALL_ACTION_VARIANCE
 from ..exceptions import EquilibriumError, GraspError, NoContactError
-from ..foresight import BlindPose
 from ..kinematics import GraspState
 from ..model import KinematicModel
 from ..plant import FramesAtRest, Plant
@@ -130,28 +129,21 @@ class Bench:
         about: Trial,
         start: GraspState,
         *,
-        learn: bool = True,
         events: Sequence[Tug | PlantChange] = (),
-        touch: bool | None = None,
         poses: bool = False,
     ) -> TrialRecord:
         """Turn the object that is held.
 
         Args:
             start: from where, as measured.
-            learn: train after every motion (an E-KM only).
             events: what happens on the way; ``at`` counts this trial's commands from 0.
-            touch: without a camera, with touch or by prediction alone; None: with the camera.
             poses: keep the true poses, for pictures.
         """
         now = self.disturbed.count
         self.disturbed.events = tuple(dataclasses.replace(event, at=event.at + now) for event in events)
         axis = self.hand.rotation_axis
         target = PoseTarget.turned(start, axis, about.angle_deg * _DEG)
-        plant = self.plant
-        if touch is not None:
-            plant = BlindPose(plant, self._predictor, axis, touch=touch)
-        self.last = self.closed_loop(plant, learn=learn).run(target)
+        self.last = self.closed_loop(self.plant).run(target)
         if self.last.stop.cause is not None:  # Ctrl-C, or a failure of the plant: this is no trial
             raise self.last.stop.cause
         return TrialRecord.of(about, self.last, axis, learns=self.learns, poses=poses)
@@ -160,23 +152,20 @@ class Bench:
         """Close the plant: its simulation and rendering end; the bench is not used afterwards."""
         self.plant.close()
 
-    @property
-    def _predictor(self) -> KinematicModel | EnhancedModel:
-        return self.model if self.enhanced is None else self.enhanced
-
     def look_and_move(self, focus: FocusedPose | None = None) -> LookAndMoveController:
         """The controller of the next turn, with what is known now; by default about the hand's axis."""
         setting, focused = self.setting, self.hand.rotation_axis if focus is None else focus
         figures = {"limiting": setting.limiting, "bound": setting.bound}
-        return self.controllers(self._predictor, focused, setting.tasks, setting.limits, **figures)
+        model = self.model if self.enhanced is None else self.enhanced
+        return self.controllers(model, focused, setting.tasks, setting.limits, **figures)
 
     def closed_loop(
-        self, plant: Plant, focus: FocusedPose | None = None, *, learn: bool = True, decline: bool = False
+        self, plant: Plant, focus: FocusedPose | None = None, *, decline: bool = False
     ) -> ClosedLoop:
         """The loop of the next turn."""
         setting = self.setting
         known = {"knowledge": self.knowledge, "safety": setting.safety, "planner": setting.planner}
-        return self.loops(plant, self.look_and_move(focus), **known, learn=learn, decline=decline)
+        return self.loops(plant, self.look_and_move(focus), **known, decline=decline)
 
     def _prepare_learner(self, start: GraspState) -> None:
         setting = self.setting

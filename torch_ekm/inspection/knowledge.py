@@ -80,10 +80,9 @@ def estimates(knowledge: HandKnowledge) -> list[Estimated]:
     for i, (scale, std) in enumerate(zip(forces.scale.tolist(), forces.scale_std.tolist(), strict=True)):
         found.append(Estimated("forces", f"pad {i}", "of the model's answer", scale, std, 1.0, ""))
     if isinstance(learned, HandFigures):
-        changed = {one.name: f"changed after {one.motion} motions" for one in learned.changes}
         for one in learned.figures:
             unit, figure = (_DEG, "width [deg]") if one.is_width else (1.0, "of its description")
-            note = changed.get(one.name, "" if one.identified else NOT_IDENTIFIED)
+            note = "" if one.identified else NOT_IDENTIFIED
             figures = (one.factor / unit, one.std / unit, one.described / unit)
             found.append(Estimated("figures", one.name, figure, *figures, note))
     for name, share in (("along", error.along), ("across", error.across)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from .calibration import calibrate
 from .contact_motion import ContactMode, ContactMotion, ContactStep
 from .grasp_forces import GraspForces
 from .kinematic_model import KinematicModel
@@ -20,5 +19,4 @@ __all__ = [
     "Linearization",
     "ModelOptions",
     "ModelStatus",
-    "calibrate",
 ]

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .._arrays import as_states, eye, like, namespace, norm, zeros
+from .._arrays import as_states, eye, namespace, norm, zeros
 from .._noise import NOISE
 from ..contact.contacts import CHARACTERISTIC_LENGTH, ContactKinematics, ContactSet
 from ..contact.forces import (
@@ -64,8 +64,6 @@ class GraspForces:
     covariance: Float[Tensor, "*batch m m"] | None = None
     """Of the contact forces ``[f_1; m_1; ..]``, hand axes, m = 4 n_c. None where nothing was measured or
     expected: the smallest forces are a choice, not an estimate."""
-    margin_std: Float[Tensor, "*batch n_c"] | None = None
-    """Standard deviation of ``margin`` [N]; None likewise."""
     loop: Float[Tensor, "*batch n_l"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
     """nu, forces of the loops, ``-(dc/dq)^T nu`` on the joints."""
 
@@ -89,18 +87,12 @@ class ExpectedForces:
     """``f_n' = f' . n_in'``, n_in' the turned inward normal [N]; below 0 the contact opens."""
     margin: Float[Tensor, "*batch n_c"]
     """``mu_s f_n' - |u'|``, u' = f_t' (soft fingers: with the scaled spin moment) [N]."""
-    actuator: Float[Tensor, "*batch n_a"]
-    """``-(lam + dlam)``, force of each actuator along +a [N m]."""
     covariance: Float[Tensor, "*batch m m"]
     """Of the stacked contact forces, m = 4 n_c: that before the increment and what the increment adds."""
-    margin_std: Float[Tensor, "*batch n_c"]
-    """Standard deviation of ``margin`` [N]."""
 
 
-def friction_use(
-    contacts: ContactSet, force: AnyArray, spin: AnyArray, normal: AnyArray
-) -> tuple[Any, Any, Any]:
-    """``f_n``, ``mu_s f_n - |u|`` [N] and the margin's gradient ``(*batch, n_c, 4)`` in ``[f; m]``.
+def friction_use(contacts: ContactSet, force: AnyArray, spin: AnyArray, normal: AnyArray) -> tuple[Any, Any]:
+    """``f_n`` and ``mu_s f_n - |u|`` [N].
 
     Args:
         normal: outward normals of the object.
@@ -110,22 +102,7 @@ def friction_use(
     f_t = force - f_n[..., None] * n_in
     scale = mu_s / gamma.clip(1e-9) * (gamma > 0)
     u = xp.concat([f_t, (scale * spin)[..., None]], -1)
-    size = norm(u)
-    direction = u / size.clip(1e-9)[..., None]
-    across = -(scale * direction[..., 3])[..., None]
-    gradient = xp.concat([mu_s[:, None] * n_in - direction[..., :3], across], -1)
-    return f_n, mu_s * f_n - size, gradient
-
-
-def margin_std(
-    contacts: ContactSet, normal_force: AnyArray, gradient: AnyArray, covariance: AnyArray
-) -> Float[Any, "*batch n_c"]:
-    """``sqrt(g^T Sigma g + (s mu_s f_n)^2)``, g the margin's gradient, s of the friction coefficient [N]."""
-    xp, n_c = namespace(covariance), contacts.n_c
-    blocks = covariance.reshape(*covariance.shape[:-2], n_c, 4, n_c, 4)
-    own = xp.moveaxis(xp.diagonal(blocks, 0, -4, -2), -1, -3)
-    variance = (gradient[..., None, :] @ own @ gradient[..., None])[..., 0, 0]
-    return xp.sqrt(variance.clip(0.0) + (NOISE.friction * contacts.friction * normal_force) ** 2)
+    return f_n, mu_s * f_n - norm(u)
 
 
 def start_covariance(
@@ -358,11 +335,7 @@ class ForceBalance:
             return forces
         sure = prior.stacked(np.array([solution.covariance for _, solution in problems]))
         sure = sure.reshape(*batch, *sure.shape[-2:])
-        sure = torch.from_numpy(sure).to(q) if isinstance(q, Tensor) else sure
-        force, spin = like(forces.force, sure), like(forces.spin_moment, sure)
-        normal, _, gradient = friction_use(kin.contacts, force, spin, kin.contacts.normal)
-        std = margin_std(kin.contacts, normal, gradient, sure)
-        return dataclasses.replace(forces, covariance=torch.as_tensor(sure), margin_std=torch.as_tensor(std))
+        return dataclasses.replace(forces, covariance=torch.from_numpy(sure).to(forces.mu))
 
     def _reduced(self, A: AnyArray, V_s: AnyArray) -> tuple[Any, Any, Any, Any]:
         """``-(A_p Z_p)^T``, ``Z_p^T V_p``, ``(A_q Z)^T``, ``Z^T V_q``: both in permitted motions."""

@@ -370,9 +370,9 @@ class KinematicModel(nn.Module):
             D[..., :n_q, :n_q] += bends(self.hand, at.q, actuation, f.lam, f.loop)
         held = self.balance.held_by_stops(at.q, f.stop_torque)
         slack = like(self.balance.slack(forces), at.q)
-        J, dmu, dlam, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable, arms)
+        J, dmu, stability = self.reduction.solve(D, A, kin.rows, held, slack, o.on_unstable, arms)
         found = sensitivities(kin, f, J, dmu)
-        dlam, held, stability, D, A, slack = map(torch.as_tensor, (dlam, held, stability, D, A, slack))
+        held, stability, D, A, slack = map(torch.as_tensor, (held, stability, D, A, slack))
         equations = None
         if held.dim() == 1:
             moving = self.moving(contacts)
@@ -385,7 +385,6 @@ class KinematicModel(nn.Module):
             contacts=contacts,
             forces=forces,
             **found,
-            actuator_force_sensitivity=dlam,
             held_joints=held,
             stability=stability,
             options=o,

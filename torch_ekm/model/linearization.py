@@ -9,12 +9,12 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 
-from .._arrays import as_tensors, eye, in_numpy, in_torch, is_plain, like, namespace, norm, of_fields, zeros
+from .._arrays import as_tensors, eye, in_numpy, in_torch, is_plain, like, norm, of_fields, zeros
 from .._checks import check_finite, check_last
-from ..contact.contacts import ContactKinematics, ContactModel, ContactSet
+from ..contact.contacts import ContactKinematics, ContactSet
 from ..kinematics.poses import GraspState
 from ..typing import AnyArray, Bool, Float, Tensor
-from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, margin_std, start_covariance
+from .grasp_forces import ExpectedForces, GraspForces, drift, friction_use, start_covariance
 from .reduction import Drives, Reduction, two_stage
 from .stiffness import SAME, Arms
 from .validity import Doubt, ModelOptions, ModelStatus
@@ -132,12 +132,8 @@ class Linearization:
     """J_m."""
     contact_force_sensitivity: Float[Tensor, "*batch n_h n_a"]
     """dmu/da [N/rad]: change of the force vectors, read in the present contact frames."""
-    actuator_force_sensitivity: Float[Tensor, "*batch n_a n_a"]
-    """dlam/da [N m/rad]."""
     normal_force_sensitivity: Float[Tensor, "*batch n_c n_a"]
     """d f_n/da [N/rad], the turning of the normals included: rows for regulating the grip."""
-    margin_sensitivity: Float[Tensor, "*batch n_c n_a"]
-    """d margin/da [N/rad]."""
     force_vector_sensitivity: Float[Tensor, "*batch n_c 3 n_a"]
     """df/da [N/rad]: change of the force vectors in hand axes."""
     normal_motion: Float[Tensor, "*batch n_c 3 n_a"]
@@ -206,9 +202,8 @@ class Linearization:
         return self.normal_force_sensitivity if self.described_normal is None else self.described_normal
 
     def with_normal_sensitivity(self, normal: Float[Tensor, "n_c n_a"]) -> Linearization:
-        """The same with another ``df_n/da`` [N/rad]; margins and force vectors follow."""
+        """The same with another ``df_n/da`` [N/rad]; the force vectors follow."""
         correction = normal - self.normal_force_sensitivity
-        mu_s, inward = self.contacts.friction[..., None], -self.contacts.normal[..., None]
         dmu = self.contact_force_sensitivity.index_add(
             -2, torch.tensor(self.normal_rows), correction.to(self.contact_force_sensitivity)
         )
@@ -217,8 +212,8 @@ class Linearization:
             contact_force_sensitivity=dmu,
             normal_force_sensitivity=normal,
             described_normal=self.described_normal_sensitivity,
-            margin_sensitivity=self.margin_sensitivity + mu_s * correction,
-            force_vector_sensitivity=self.force_vector_sensitivity + inward * correction[..., None, :],
+            force_vector_sensitivity=self.force_vector_sensitivity
+            - self.contacts.normal[..., None] * correction[..., None, :],
         )
 
     def step(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_s"]:
@@ -253,7 +248,7 @@ class Linearization:
         normal = self.contacts.normal + _times(self.normal_motion, da[..., None, :])
         normal = normal / norm(normal)[..., None]
         force, spin = self.forces.force + df, self.forces.spin_moment + dspin
-        f_n, margin, gradient = friction_use(self.contacts, force, spin, normal)
+        f_n, margin = friction_use(self.contacts, force, spin, normal)
         covariance = self.forces.covariance
         if covariance is None:
             covariance = start_covariance(self.contacts.normal, self.options.forces)
@@ -265,15 +260,11 @@ class Linearization:
             spin_moment=spin,
             normal=f_n,
             margin=margin,
-            actuator=-(self.forces.lam + _times(self.actuator_force_sensitivity, da)),
             covariance=covariance,
-            margin_std=margin_std(self.contacts, f_n, gradient, covariance),
         )
 
     def margins_after(self, delta_a: Float[Tensor, "*batch n_a"]) -> Float[Tensor, "*batch n_c"]:
         """``mu_s f_n' - |u'|`` of each contact [N], f' from :meth:`forces_after`; below 0 it will slip.
-
-        ``margins + margin_sensitivity da`` to first order, but exact in the cone.
 
         Raises:
             ShapeError, NonFiniteError: as of :meth:`step`.
@@ -300,7 +291,6 @@ def sensitivities(
         "manipulation_jacobian": J,
         "contact_force_sensitivity": dmu,
         "normal_force_sensitivity": normal,
-        "margin_sensitivity": _of_margins(kin, forces, dmu, df, dn, normal),
         "force_vector_sensitivity": df,
         "normal_motion": dn,
     }
@@ -325,28 +315,6 @@ def force_change(
     full = zeros(dmu, *batch, 6 * n_c, n_a)
     full[..., kin.row_index, :] = dmu
     return kin.frame @ full.reshape(*batch, n_c, 6, n_a)[..., :3, :]
-
-
-def _of_margins(
-    kin: ContactKinematics, forces: GraspForces, dmu: AnyArray, df: AnyArray, dn: AnyArray, normal: AnyArray
-) -> Float[AnyArray, "*batch n_c n_a"]:
-    """``d (mu_s f_n - |u|)/da``, ``u = [f_t; m_n mu_s/gamma]`` [N/rad]; ``d|u|`` counts as 0 at u = 0."""
-    mu_s, gamma = kin.contacts.friction, kin.contacts.torsional_friction
-    n_in = -kin.contacts.normal
-    f_t = forces.force - forces.normal[..., None] * n_in
-    df_t = df + forces.normal[..., None, None] * dn
-    square, product = (f_t * f_t).sum(-1), (f_t[..., None, :] @ df_t)[..., 0, :]
-    soft = [i for i, model in enumerate(kin.models) if model is ContactModel.SOFT_FINGER]
-    if soft:
-        at = [kin.normal_rows[i] + 3 for i in soft]
-        scale2 = (mu_s[soft] / gamma[soft].clip(1e-9)) ** 2
-        moment = forces.spin_moment[..., soft]
-        square[..., soft] += scale2 * moment**2
-        product[..., soft, :] += (scale2 * moment)[..., None] * dmu[..., at, :]
-    xp = namespace(square)
-    size = xp.sqrt(square)[..., None]
-    slope = xp.where(size > 1e-9, product / size.clip(1e-9), 0.0)
-    return mu_s[:, None] * normal - slope
 
 
 @runtime_checkable

@@ -203,9 +203,9 @@ def _judge(K: Tensor, N: Tensor, stability: Tensor, tolerance: Tensor, *, on_uns
 _TWO_HARD = "two hard fingers cannot hold anything in space: write planar_normal, or torsional_friction"
 
 
-GraspResponse = tuple[AnyArray, AnyArray, AnyArray, Any]
-"""J_m ``(*batch, n_s, n_a)``, dmu/da ``(*batch, n_h, n_a)``, dlam/da ``(*batch, n_a, n_a)``, and the smallest
-eigenvalue of the stiffness with the actuators locked ``(*batch)``."""
+GraspResponse = tuple[AnyArray, AnyArray, Any]
+"""J_m ``(*batch, n_s, n_a)``, dmu/da ``(*batch, n_h, n_a)``, and the smallest eigenvalue of the stiffness
+with the actuators locked ``(*batch)``."""
 
 
 class Drives(NamedTuple):
@@ -262,7 +262,7 @@ class Reduction(nn.Module):
         on_unstable: str,
         arms: Arms = SAME,
     ) -> GraspResponse:
-        """J_m, dmu/da and dlam/da in full coordinates; states that differ in what is held are grouped.
+        """J_m and dmu/da in full coordinates; states that differ in what is held are grouped.
 
         ```
         D' = Z^T D Z + B_c^T K_a B_c          compliant actuators stand in the stiffness
@@ -295,8 +295,8 @@ class Reduction(nn.Module):
             parts = parts or [part.new_empty(len(pattern), *part.shape[1:]) for part in group]
             for whole, part in zip(parts, group, strict=True):
                 whole[at] = part
-        motion, contact, actuator, stability = (part.reshape(*batch, *part.shape[1:]) for part in parts)
-        return motion, contact, actuator, stability
+        motion, contact, stability = (part.reshape(*batch, *part.shape[1:]) for part in parts)
+        return motion, contact, stability
 
     @property
     def drives(self) -> Drives:
@@ -368,10 +368,9 @@ class Reduction(nn.Module):
                 if spatial and len(rows) == 6 and float(error.direction[-3:].square().sum()) > 0.5:
                     error.args = (_TWO_HARD,)
             raise
-        dlam = system.actuator_force(step, n_h)
         dmu = system.row_scale[:, None] * step.reaction[..., :n_h, :]
         S = like(self.scaled_basis, dmu)
-        return _left(S.mT, step.motion), dmu, dlam, step.stability
+        return _left(S.mT, step.motion), dmu, step.stability
 
 
 class ReducedStep(NamedTuple):

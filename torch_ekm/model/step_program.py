@@ -354,15 +354,6 @@ class HandLaws:
         gap[len(problem.mu_s) + np.arange(len(self.cables)), self.cables] = -1.0
         return answer.response(load, gap)
 
-    def actuator_response(self, here: PlacedGrasp, rates: Response, n_c: int) -> Array:
-        """dlam/da of the actuators, ``(n_a, n_a)`` [N m/rad]; ``n_c``: number of the program's contacts."""
-        change = np.zeros((self.hand.n_a, self.hand.n_a))
-        own = np.eye(len(change))[self.springs]
-        B = self.arms(here)[self.springs]
-        change[self.springs] = self.K[self.springs, None] * (B @ rates.z - own)
-        change[self.cables] = -rates.lam[n_c : n_c + len(self.cables)]
-        return change
-
 
 def _slid(here: PlacedGrasp, first: PlacedGrasp, total: Array) -> Array:
     """Slide of each contact in the step so far: the mean of what z means at both ends [scaled]. A contact
@@ -427,7 +418,6 @@ def mode_linearization(
         contacts=contacts,
         forces=forces,
         **sensitivities(kin, forces, torch.from_numpy(laws.S @ rates.z), torch.from_numpy(np.stack(dmu))),
-        actuator_force_sensitivity=torch.from_numpy(laws.actuator_response(grasp, rates, n_c)),
         held_joints=torch.from_numpy(stop != 0),
         stability=stability,
         options=o,
