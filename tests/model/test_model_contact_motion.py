@@ -98,7 +98,6 @@ def test_where_contacts_stick_it_moves_as_the_manipulation_jacobian_says(held, e
     torch.testing.assert_close(margin_slopes(lin), margin_slopes(start), rtol=1e-4, atol=1e-2)
     step = motion.move(w)
     assert set(step.modes.values()) <= {ContactMode.STICK, ContactMode.OPEN}
-    assert not step.slid
     assert (step.increment - start.step(w)).norm() < 0.05 * step.increment.norm()
     compare(motion, w)
 
@@ -109,8 +108,6 @@ def test_where_a_contact_slides_the_derivative_is_that_of_sliding(held, exact) -
     for _ in range(4):
         step = motion.move(w)
     (slides,) = [name for name, mode in step.modes.items() if mode is ContactMode.SLIDE]
-    assert step.slid[slides] > 3e-5
-    assert abs(step.margin[slides]) < 1e-3
     assert step.normal[slides] > 0.5
     compare(motion, w)
     at = motion.linearize(1e-3 * w)
@@ -298,7 +295,7 @@ def test_steps_that_slide_are_predicted_better_than_by_contacts_that_stick() -> 
         after = plant.command(turning(lin, axis, -3.0 * DEG))
         w, ds = after.a - seen.a, after.truth.state.minus(state)
         step = model.step(state, w, fingertip_force=force, a=seen.a)
-        if max(step.slid.values(), default=0.0) > 1e-4:
+        if ContactMode.SLIDE in step.modes.values():
             sticks.append(float((ds - model.linearize(state, fingertip_force=force).step(w))[-3:].norm()))
             steps.append(float((ds - step.increment)[-3:].norm()))
         seen = after

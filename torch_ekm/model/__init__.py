@@ -6,11 +6,9 @@ from .contact_motion import ContactMode, ContactMotion, ContactStep
 from .grasp_forces import GraspForces
 from .kinematic_model import KinematicModel
 from .linearization import Linearization
-from .step_program import ContactLoads
 from .validity import ModelOptions, ModelStatus
 
 __all__ = [
-    "ContactLoads",
     "ContactMode",
     "ContactMotion",
     "ContactStep",

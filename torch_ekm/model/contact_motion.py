@@ -61,14 +61,9 @@ class ContactStep:
     """After it."""
     increment: Float[Tensor, " n_s"]
     """``[dq; do; dphi]`` [rad, m, rad]."""
-    loads: ContactLoads
     normal: dict[str, float]
     """f_n after it [N]."""
-    margin: dict[str, float]
-    """``mu_s f_n - |u|`` after it [N]: 0 while a contact slides."""
     modes: dict[str, ContactMode]
-    slid: dict[str, float]
-    """How far each contact slid [m]; those that did not are left out."""
     jacobian: Float[Tensor, "n_s n_a"]
     """``d increment/d da`` of the last substep, contacts doing what they do at its end."""
 
@@ -99,7 +94,6 @@ class _Substep(NamedTuple):
     last: _Solved
     rates: Response
     """By da."""
-    slid: dict[str, float]
 
 
 class ContactMotion:
@@ -195,7 +189,7 @@ class ContactMotion:
         self._settle()
         start = self._start
         before, names = (self.state, self._placed, self.loads, self._near), start.grasp.contacts.finger
-        way, slid = delta_a.detach().double().numpy(), dict[str, float]()
+        way = delta_a.detach().double().numpy()
         share = 1 / max(1, math.ceil(float(np.abs(way).max(initial=0.0)) / _LARGEST))
         done = 0.0
         while True:
@@ -209,10 +203,9 @@ class ContactMotion:
                 ends = self._why()
                 self._stand(*before)
                 raise ends
-            _add(slid, found.slid)
             done += share
             if done > 1 - 1e-9:
-                return self._report(before[0], names, found, slid)
+                return self._report(before[0], names, found)
 
     def linearize(self, delta_a: Float[Tensor, " n_a"]) -> Linearization:
         """``d increment/d da`` here, in the mode that a motion by ``delta_a`` [rad] brings: contacts stick,
@@ -281,7 +274,7 @@ class ContactMotion:
                 near = _Start(here, loads, -done.answer.z) if size < _CLOSE else None
                 self._stand(done.state, None, done.loads, near)
                 rates = self._laws.response(here, done.program.problem, done.answer)
-                return _Substep(done, rates, _slides(done))
+                return _Substep(done, rates)
             loads, here, was = done.loads, self._place(done.state), doing
             way = way._replace(total=way.total + done.answer.z)
         return None
@@ -289,8 +282,7 @@ class ContactMotion:
     def _fall(self, da: Array) -> _Substep | None:
         """A motion after which no equilibrium is near: the grasp moves on, damped, until it finds one.
         None: it finds none."""
-        slid, still = dict[str, float](), np.zeros(self._laws.S.shape[1])
-        fallen = still
+        fallen = still = np.zeros(self._laws.S.shape[1])
         for _ in range(_FALLS):
             way = Way(self._grasp, self.loads.pull, da, still)
             done = self._solve(self._grasp, self.loads, way, _DAMPING)
@@ -298,11 +290,9 @@ class ContactMotion:
                 return None
             self._stand(done.state, None, done.loads)
             da = np.zeros(len(da))
-            _add(slid, _slides(done))
             rest = self._substep(da) if float(np.abs(done.answer.z).max()) < _CALM else None
             if rest is not None:
-                _add(slid, rest.slid)
-                return rest._replace(slid=slid)
+                return rest
         return None
 
     def _solve(
@@ -330,17 +320,13 @@ class ContactMotion:
         n_y = joints.shape[1]
         return np.array([np.abs(joints @ z[:n_y]).max(), np.abs(z[n_y:]).max()])
 
-    def _report(
-        self, before: GraspState, names: tuple[str, ...], last: _Substep, slid: dict[str, float]
-    ) -> ContactStep:
+    def _report(self, before: GraspState, names: tuple[str, ...], last: _Substep) -> ContactStep:
         """Of a whole motion; ``names``: contacts that were near when it began."""
-        answer, mu_s = last.last.answer, last.last.program.problem.mu_s
-        lam = answer.lam[: len(mu_s)]
-        margins = mu_s * lam - np.linalg.norm(answer.t, axis=1)
+        answer = last.last.answer
         modes = dict.fromkeys((*names, *last.last.names), ContactMode.OPEN)
-        normal, margin = dict.fromkeys(modes, 0.0), dict.fromkeys(modes, 0.0)
+        normal = dict.fromkeys(modes, 0.0)
         for i, name in enumerate(last.last.names):
-            normal[name], margin[name] = float(lam[i]) / L, float(margins[i]) / L
+            normal[name] = float(answer.lam[i]) / L
             if answer.active[i]:
                 modes[name] = ContactMode.SLIDE if answer.slides[i] else ContactMode.STICK
         if all(mode is ContactMode.OPEN for mode in modes.values()):
@@ -348,11 +334,8 @@ class ContactMotion:
         return ContactStep(
             state=self.state,
             increment=self.state.minus(before),
-            loads=self.loads,
             normal=normal,
-            margin=margin,
             modes=modes,
-            slid=slid,
             jacobian=torch.from_numpy(self._laws.S @ last.rates.z),
         )
 
@@ -379,18 +362,6 @@ def _moved(state: GraspState, ds: Array) -> GraspState:
     q, position = state.q.numpy() + ds[:-6], state.position.numpy() + ds[-6:-3]
     rotation = exp(ds[-3:]) @ state.rotation.numpy()
     return in_torch(of_fields(GraspState, q=q, position=position, rotation=rotation))
-
-
-def _slides(done: _Solved) -> dict[str, float]:
-    """How far contacts slid, of those that did [m]."""
-    answer = done.answer
-    far = np.linalg.norm(done.program.problem.slides(answer.z, answer.t)[:, :2], axis=1) * L
-    return {name: x for name, x, one in zip(done.names, far.tolist(), answer.slides, strict=True) if one}
-
-
-def _add(total: dict[str, float], more: dict[str, float]) -> None:
-    for name, distance in more.items():
-        total[name] = total.get(name, 0.0) + distance
 
 
 def _loads(lin: Linearization) -> ContactLoads:
