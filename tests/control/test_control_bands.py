@@ -11,8 +11,8 @@ import torch
 from obedient_plant import untaught
 
 from torch_ekm.control import Bands, HandFigures, HandKnowledge, PoseTarget
-from torch_ekm.control.knowledge import STEADY, ModelError
 from torch_ekm.control.rehearsal import lets_go, servo_std
+from torch_ekm.estimation.knowledge import STEADY, ModelError
 
 DEG = math.pi / 180
 F64 = torch.float64

@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from torch_ekm.cli import app
 from torch_ekm.control import ClosedLoop, DescribedFigures, HandKnowledge, LookAndMoveController, PoseTarget
-from torch_ekm.control.knowledge import ModelError, previous
 from torch_ekm.enhanced import ParameterFilter, save
 from torch_ekm.estimation.filters import ForceSensitivity
+from torch_ekm.estimation.knowledge import ModelError, previous
 from torch_ekm.exceptions import FileFormatError, ParameterError, StateError, StateMismatchError
 from torch_ekm.kinematics import ServoModel
 from torch_ekm.kinematics.servo_model import IdealServos

@@ -18,7 +18,7 @@ from torch_ekm.control import (
     LookAndMoveController,
     PoseTarget,
 )
-from torch_ekm.control.knowledge import Lessons
+from torch_ekm.control.lessons import Lessons
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.model import KinematicModel
 

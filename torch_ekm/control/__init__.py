@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..estimation.filters import ForceSensitivity
 from ..estimation.hand_figures import DescribedFigures, HandFigures
+from ..estimation.knowledge import HandKnowledge
 from .closed_loop import ClosedLoop
 from .controller import LookAndMoveController
 from .decision import Band, Decision, Manipulation, Piece, Step, Stop, StopReason, Waypoint
@@ -11,7 +12,6 @@ from .ends import Safety, StoppingRule
 from .focus import Direction, FocusedPose, PoseTarget
 from .guards import Guards
 from .journal import Journal
-from .knowledge import HandKnowledge
 from .model_hand import ModelHand
 from .plan import OneStep, Plan, Planner, Reach, WholeTurn
 from .program import Bounds, Equality, Inequality, LinearizedModel, Situation, Squares

@@ -15,6 +15,7 @@ from torch import nn
 from .._checks import check_kind
 from .._extras import require
 from ..estimation.hand_figures import DescribedFigures, HandFigures
+from ..estimation.knowledge import HandKnowledge
 from ..exceptions import NoStateError, StateError
 from ..plant import Gate, Observation, Path, Plant, PlantStatus, ServoInverse
 from ..residual.sparse_gp.engine.loading import load_loops
@@ -24,7 +25,7 @@ from .decision import Decision, Expectation, Manipulation, Step, Stop, StopReaso
 from .ends import Ends, Safety, failed
 from .focus import PoseTarget
 from .guards import Objection, gravest
-from .knowledge import HandKnowledge, Lessons
+from .lessons import Lessons
 from .plan import OneStep, Plan, Planner, Reach, WholeTurn, reach
 from .watch import OnTheWay, Watch
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import torch
 
 from .._noise import DEGREE
+from ..estimation.knowledge import HandKnowledge
 from ..exceptions import ParameterError
 from ..kinematics import GraspState
 from ..plant import Observation
@@ -18,7 +19,6 @@ from ..typing import Tensor
 from .controller import LookAndMoveController
 from .decision import Band, Decision, StopReason, Waypoint
 from .focus import FocusedPose, PoseTarget
-from .knowledge import HandKnowledge
 from .model_hand import ModelHand
 from .rehearsal import DEVIATIONS, LONGEST, End, PathEnd, Rehearsal, is_loose, lets_go
 

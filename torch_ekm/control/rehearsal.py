@@ -15,6 +15,7 @@ import torch
 from .._noise import DEGREE, NOISE
 from ..description import HandDescription
 from ..estimation.hand_figures import HandFigures
+from ..estimation.knowledge import STEADY, HandKnowledge
 from ..exceptions import NoContactError, UnstableGraspError
 from ..kinematics import GraspState
 from ..model import Linearization
@@ -24,7 +25,6 @@ from ..typing import Array, Float, Tensor
 from .controller import LookAndMoveController
 from .decision import Band, Decision, Piece, StopReason, Waypoint
 from .focus import PoseTarget
-from .knowledge import STEADY, HandKnowledge
 from .model_hand import ModelHand
 from .tasks import LimitingFunction
 

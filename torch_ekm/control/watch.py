@@ -11,12 +11,13 @@ import numpy as np
 import torch
 
 from .._noise import DEGREE, NOISE
+from ..estimation.knowledge import HandKnowledge
 from ..model import KinematicModel
 from ..plant import Observation, PlantStatus
 from ..typing import Array, Tensor
 from .decision import Decision, Expectation, StopReason
 from .guards import Effect, Guards, Objection, ReadingTests, against, agree, deg, gravest
-from .knowledge import HandKnowledge, felt
+from .lessons import felt
 from .motions import FingertipTests, MotionTests
 from .rehearsal import DEVIATIONS
 

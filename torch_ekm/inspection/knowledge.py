@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..control import HandKnowledge
-from ..control.knowledge import Part, previous
 from ..description import load_hand
 from ..estimation.hand_figures import HandFigures
+from ..estimation.knowledge import Part, previous
 from ..exceptions import EKMError
 from ..kinematics import ServoModel
 
