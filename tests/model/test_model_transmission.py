@@ -57,24 +57,6 @@ def test_the_model_says_the_same_where_contacts_stick(motion: ContactMotion) -> 
     )
 
 
-def test_the_slope_of_j_m_along_the_state_is_that_of_differences(motion: ContactMotion) -> None:
-    """Autograd through changing arms: the joints' torques that the actuators give."""
-    model, state = motion.model, motion.state
-    contacts = model.contacts(state)
-    q = state.q.clone().requires_grad_()
-    forces = model.linearize(GraspState(q, state.position, state.rotation), contacts).forces
-    (slope,) = torch.autograd.grad(forces.normal.sum(), q)
-    h, eye = 1e-6, torch.eye(len(q), dtype=torch.float64)
-    found = []
-    for one in eye:
-        ends = [
-            model.linearize(GraspState(state.q + s * h * one, state.position, state.rotation), contacts)
-            for s in (1, -1)
-        ]
-        found.append((ends[0].forces.normal.sum() - ends[1].forces.normal.sum()) / (2 * h))
-    torch.testing.assert_close(slope, torch.stack(found), atol=2e-3, rtol=1e-3)
-
-
 def test_a_batch_is_its_states(motion: ContactMotion) -> None:
     model, state = motion.model, motion.state
     contacts = model.contacts(state)

@@ -179,14 +179,12 @@ def test_the_name_of_the_actuator_that_cannot_move(toy):
         dataclasses.replace(a, name=n)
         for a, n in zip((*toy.model.hand.actuators, toy.model.hand.actuators[0]), "pqrs", strict=True)
     )
-    moved = dataclasses.replace(toy.state, q=toy.state.q.clone().requires_grad_())
     for on_unstable in ("raise", "flag"):
         model = changed(
             toy.model, options={"on_unstable": on_unstable}, actuation_jacobian=doubled, actuators=actuators
         )
-        for state in (toy.state, moved):
-            with pytest.raises(SingularGraspError, match=r"actuator '[ps]' cannot move alone"):
-                model.linearize(state)
+        with pytest.raises(SingularGraspError, match=r"actuator '[ps]' cannot move alone"):
+            model.linearize(toy.state)
 
 
 @pytest.mark.parametrize("toy", [three_finger, soft_two_finger])

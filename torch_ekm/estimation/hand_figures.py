@@ -258,8 +258,7 @@ class HandFigures(ParameterFilter):
             motion = equations.solve(*self.present(equations.reduction.drives))
         except GraspError:
             return None
-        if not motion.jacobian.requires_grad:  # a graph serves once
-            self._solved = equations, self.mean.numpy().copy(), motion
+        self._solved = equations, self.mean.numpy().copy(), motion
         return motion
 
     def present(self, described: Drives) -> tuple[Float[Tensor, " n_q"], Drives]:

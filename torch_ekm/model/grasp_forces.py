@@ -30,7 +30,6 @@ from ..contact.forces import (
 from ..description.hand import HandDescription
 from ..exceptions import ShapeError
 from ..typing import AnyArray, Array, Bool, Float, Tensor
-from .gradients import differentiable_forces
 from .reduction import Reduction
 from .stiffness import SAME, Arms
 
@@ -276,7 +275,7 @@ class ForceBalance:
         if arms.closed is not None:
             closed = as_states(torch.as_tensor(arms.closed).detach().double().cpu().numpy(), 2)
         table: list[tuple] = []
-        problems: list[tuple[BalanceEquations, ForceSolution]] = []
+        solutions: list[ForceSolution] = []
         for k, (q_k, G, object_load, hand_matrix, hand_load) in enumerate(states):
             joints, lower, upper = self._bounded(q_k)
             bounded = -self.joint_basis[joints].T
@@ -316,7 +315,7 @@ class ForceBalance:
             else:
                 mu, lam = np.zeros_like(mu), np.zeros_like(lam)
             table.append((mu, lam, residual, torque, *margins(cones, mu), [solution.violation], loop))
-            problems.append((eq, solution))
+            solutions.append(solution)
 
         names = ("mu", "lam", "residual", "stop_torque", "margin", "relative_margin", "violation", "loop")
         ends = np.cumsum([len(part) for part in table[0]])[:-1]
@@ -325,15 +324,11 @@ class ForceBalance:
         if isinstance(q, Tensor):
             parts = {name: torch.from_numpy(value).to(q) for name, value in parts.items()}
         parts["violation"] = parts["violation"][..., 0]
-        inputs = A, V_s, self.reduction.actuation
-        if isinstance(q, Tensor) and torch.is_grad_enabled() and any(x.requires_grad for x in inputs):
-            moving = self._with_graph(problems, arms, A, V_s, *(parts[name] for name in names[:3]))
-            parts.update(zip(names, moving, strict=False))
-        status = tuple(solution.status for _, solution in problems)
+        status = tuple(solution.status for solution in solutions)
         forces = pack_forces(kin, **parts, status=status)
         if prior is None or not forces.solved:
             return forces
-        sure = prior.stacked(np.array([solution.covariance for _, solution in problems]))
+        sure = prior.stacked(np.array([solution.covariance for solution in solutions]))
         sure = sure.reshape(*batch, *sure.shape[-2:])
         return dataclasses.replace(forces, covariance=torch.from_numpy(sure).to(forces.mu))
 
@@ -343,36 +338,6 @@ class ForceBalance:
         if isinstance(A, Tensor):
             Z_p, Z = (torch.from_numpy(basis).to(A) for basis in (Z_p, Z))
         return -Z_p.mT @ A[..., n_q:].mT, V_s[..., n_q:] @ Z_p, Z.mT @ A[..., :n_q].mT, V_s[..., :n_q] @ Z
-
-    def _with_graph(
-        self,
-        problems: list[tuple[BalanceEquations, ForceSolution]],
-        arms: Arms,
-        A: Tensor,
-        V_s: Tensor,
-        *found: Tensor,
-    ) -> tuple[Tensor, ...]:
-        """``mu``, ``lam`` and e with their derivative; those of an unsolved problem are constants."""
-        Z, lift = (torch.from_numpy(x).to(A) for x in (self.joint_basis, self.lift))
-        batch = V_s.dim() - 1
-        parts = [x.reshape(-1, *x.shape[batch:]) for x in (*found, *self._reduced(A, V_s))]
-        rows = []
-        for k, (eq, solution) in enumerate(problems):
-            mu, lam, e, *given = (part[k] for part in parts)
-            if solution.status is ForceStatus.SOLVED:
-                at = arms.one(k)
-                mu, lam, e = differentiable_forces(
-                    eq,
-                    self.options,
-                    solution,
-                    *given,
-                    actuator_matrix=(at.of(self.reduction.actuation) @ Z).mT,
-                    closed=None if at.closed is None else (at.closed @ Z).mT,
-                )
-                e = lift @ e
-            rows.append((mu, lam, e))
-        stacked = zip(zip(*rows, strict=True), found, strict=True)
-        return tuple(torch.stack(part).reshape(old.shape) for part, old in stacked)
 
     def _bounded(self, q: np.ndarray) -> tuple[list[int], np.ndarray, np.ndarray]:
         """Joints with a torque of their own, and its bounds: stops push inwards."""

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import nn
@@ -20,7 +17,6 @@ from ..exceptions import NoContactError
 from ..kinematics.poses import A_STATE, GraspState, HandKinematics, Kinematics, LinkPoses
 from ..typing import AnyArray, Bool, Float, Tensor
 from .contact_motion import ContactMotion, ContactStep
-from .gradients import following
 from .grasp_forces import ExpectedForces, ForceBalance, GraspForces
 from .linearization import FollowedFigures, Linearization, MotionEquations, sensitivities
 from .reduction import Reduction
@@ -39,20 +35,6 @@ TOUCHING = 0.2e-3
 """Gap of a link that counts as touching [m]."""
 _SOFTENS = 0.85  # of the stiffness without forces, below which a grasp is gripped no harder
 _FORCES = "mu", "force", "normal", "spin_moment"
-
-
-def only_if_asked(method: Callable[..., Any]) -> Any:
-    """Record a graph only where a buffer of the model or the state requires a gradient."""
-
-    @functools.wraps(method)
-    def wrapped(self: Any, state: GraspState, *args: Any, **kwargs: Any) -> Any:
-        check_kind("state", state, GraspState, A_STATE)
-        figures = self.spring_stiffness, self.spring_rest, *self.reduction.drives, self.weight, self.com
-        given = *figures, state.q, state.position, state.rotation
-        with torch.set_grad_enabled(torch.is_grad_enabled() and any(x.requires_grad for x in given)):
-            return method(self, state, *args, **kwargs)
-
-    return wrapped
 
 
 class KinematicModel(nn.Module):
@@ -206,17 +188,14 @@ class KinematicModel(nn.Module):
         self, state: GraspState, poses: LinkPoses | None, fingertip_force: Tensor | None
     ) -> ContactSet:
         detector, place = self.touch_detector, (state.position, state.rotation)
-        with torch.no_grad():
-            if isinstance(detector, ContactDetector):
-                at = state.q if poses is None else poses
-                contacts = detector(at, *place, self.pressing(fingertip_force))
-            else:
-                contacts = detector(state.q, *place)
+        if isinstance(detector, ContactDetector):
+            at = state.q if poses is None else poses
+            contacts = detector(at, *place, self.pressing(fingertip_force))
+        else:
+            contacts = detector(state.q, *place)
         if contacts.n_c == 0:
             raise NoContactError("no finger touches the object, so no actuator can move it")
-        if not torch.is_grad_enabled():
-            return contacts
-        return following(contacts, lambda at: self.contacts(at, fingertip_force), state)
+        return contacts
 
     def pressing(self, fingertip_force: Tensor | None) -> tuple[str, ...]:
         """Pads that measure a force."""
@@ -298,7 +277,7 @@ class KinematicModel(nn.Module):
             contacts, state.position, axis, origin, upstream[links], plane=self.plane, rolling=rolling
         )
 
-    @only_if_asked
+    @torch.no_grad()
     def linearize(
         self,
         state: GraspState,
@@ -312,10 +291,7 @@ class KinematicModel(nn.Module):
     ) -> Linearization:
         """Contacts, forces, ``J_m``, the force sensitivities and their doubts, at a state.
 
-        Differentiable: with respect to the state, and to the buffers ``spring_stiffness``, ``spring_rest``,
-        ``reduction.actuation``, ``reduction.stiffness``, ``weight`` and ``com`` (``requires_grad_()`` asks
-        for it). Forces and detected contacts move along. First
-        derivatives only; stability, margins, stop torques, and which joints are held, are constants.
+        J_m is no function of the state that autograd differentiates: a state that asks for it is refused.
 
         Args:
             state: one state, or a batch together with batched ``contacts``.
@@ -338,13 +314,14 @@ class KinematicModel(nn.Module):
             UnstableGraspError: the grasp buckles (unless ``on_unstable="flag"``).
             NonFiniteError, ParameterError, ShapeError, UnknownNameError: bad input.
         """
+        check_kind("state", state, GraspState, A_STATE)
         check_state(self.hand, state, contacts, self.weight.dtype)
         poses = self.kinematics(state.q)
         detected = contacts is None and isinstance(self.detector, ContactDetector)
         contacts = self._detect(state, poses, fingertip_force) if contacts is None else contacts
         check_contacts(state, contacts, self.link_names, self.options.max_overlap, detected)
-        # the same equations, for one state without a derivative in numpy
-        plain = state.q.dim() == 1 and not torch.is_grad_enabled() and is_plain(state.q, contacts.gap)
+        # the same equations, for one state in numpy
+        plain = state.q.dim() == 1 and is_plain(state.q, contacts.gap)
         at = in_numpy(state) if plain else state
         kin = self.contact_kinematics(at, in_numpy(contacts) if plain else contacts, poses=poses)
         A = constraint_matrix(kin)

@@ -82,8 +82,6 @@ def two_stage(
             contradict each other; the direction comes along. Independent of ``on_unstable``.
         UnstableGraspError: N^T D N has a negative eigenvalue: the grasp buckles.
     """
-    if isinstance(D, Tensor) and (D.requires_grad or E.requires_grad):
-        return _differentiable(D, E, R, F, on_unstable, actuators)
     xp = namespace(D)
     eps = xp.finfo(D.dtype).eps
     rank_tolerance, stiffness_tolerance = max(_RANK, 10 * eps), max(_STIFFNESS, 10 * eps)
@@ -105,22 +103,6 @@ def two_stage(
         J = P - N @ xp.linalg.solve(K, N.mT @ load)
     unbalanced = D @ J if F is None else D @ J - F
     return KKTSolution(J, -(pinv.mT @ unbalanced), stability, pinv, N)
-
-
-def _differentiable(
-    D: Any, E: Any, R: Any, F: Any, on_unstable: str, actuators: Sequence[str]
-) -> KKTSolution:
-    """The same, with the derivative by the implicit function theorem: that of a null space is not defined.
-
-    A second solve has the residual of both equations on its right-hand side, which is 0 and has a derivative.
-    """
-    D0, E0 = D.detach(), E.detach()
-    load = R.new_zeros(D.shape[-1], R.shape[-1]) if F is None else F
-    at = two_stage(D0, E0, R.detach(), load.detach(), on_unstable=on_unstable, actuators=actuators)
-    J, nu = at.motion, at.reaction
-    moved, loaded = R - E @ J, load - D @ J - E.mT @ nu
-    change = two_stage(D0, E0, moved - moved.detach(), loaded - loaded.detach(), on_unstable="flag")
-    return KKTSolution(J + change.motion, nu + change.reaction, at.stability, at.pinv, at.null)
 
 
 def _range_and_null(E: AnyArray, rank_tolerance: float) -> tuple[Any, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
 from .._arrays import eye, like, namespace, zeros
@@ -13,8 +12,6 @@ from ..contact.contacts import ContactKinematics
 from ..description.hand import HandDescription
 from ..kinematics.poses import cross, hat
 from ..typing import AnyArray, Array, Bool, Float, Tensor
-
-_STEP = 1e-6  # [rad] of differences along the posture
 
 
 class Arms(NamedTuple):
@@ -43,7 +40,7 @@ SAME = Arms()
 
 
 def arms_at(hand: HandDescription, q: Float[AnyArray, "*batch n_q"]) -> Arms:
-    """At a posture, with derivatives where it asks for them."""
+    """At a posture."""
     lengths, loops = hand.lengths, hand.loops
     ratio = None if lengths.constant else over_posture(q, lengths.ratio)
     return Arms(ratio, None if loops is None else over_posture(q, loops.lengths.jacobian))
@@ -72,18 +69,10 @@ def bends(
 
 
 def over_posture(q: AnyArray, function: Callable[[Array], Array]) -> Any:
-    """A function of the posture, with its derivative by central differences where q asks for it."""
+    """A function of the posture, in tensors where q is one."""
     if not isinstance(q, Tensor):
         return function(q)
-    at = q.detach().double().cpu().numpy()
-    value = torch.from_numpy(function(at)).to(q)
-    if q.requires_grad:
-        shift = _STEP * np.eye(at.shape[-1])
-        ahead, back = (function(at[..., None, :] + way) for way in (shift, -shift))
-        slope = torch.from_numpy((ahead - back) / (2 * _STEP)).to(q)
-        away = (q - q.detach()).reshape(*q.shape, *[1] * (value.dim() - q.dim() + 1))
-        value = value + (away * slope).sum(q.dim() - 1)
-    return value
+    return torch.from_numpy(function(q.double().cpu().numpy())).to(q)
 
 
 def geometric_stiffness(

@@ -76,12 +76,15 @@ def check_described(hand: Any, obj: Any) -> None:
 def check_state(
     hand: HandDescription, state: GraspState, contacts: ContactSet | None, dtype: torch.dtype
 ) -> None:
-    """One entry for each joint, contacts with a batch of states, everything in the model's precision."""
+    """One entry for each joint, contacts with a batch of states, everything in the model's precision, and no
+    graph, in which J_m would be a constant."""
     if contacts is not None:
         check_kind("contacts", contacts, ContactSet, "a ContactSet, e.g. model.contacts(state)")
     check_last("q", state.q, hand.n_q, f"the joints are: {', '.join(hand.joint_names)}")
     if contacts is None and state.q.dim() > 1:
         raise ShapeError("q", f"({hand.n_q},)", state.q.shape, "for a batch give the contacts too")
+    if state.q.requires_grad or state.position.requires_grad or state.rotation.requires_grad:
+        raise ParameterError("state", "one with a gradient", "detached: autograd does not differentiate J_m")
     for name, given in (("state", state.q), ("contacts", None if contacts is None else contacts.gap)):
         if given is not None and given.dtype != dtype:
             valid = f"{dtype}, that of the model (KinematicModel(..., dtype=), or its .to())"
