@@ -22,7 +22,7 @@ class Arms(NamedTuple):
     closed: Float[AnyArray, "*batch n_l n_q"] | None = None
     """dc/dq of the loops."""
 
-    def of(self, actuation: Float[AnyArray, "n_a n_q"]) -> Any:
+    def of(self, actuation: Float[AnyArray, "*rows n_a n_q"]) -> Any:
         """Moment arms at the posture."""
         return actuation if self.ratio is None else actuation * like(torch.as_tensor(self.ratio), actuation)
 
