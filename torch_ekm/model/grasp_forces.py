@@ -220,7 +220,7 @@ class ForceBalance:
         self.moment_rows: Mask = np.any(np.abs(self.pose_basis[3:]) > 1e-9, axis=0)
 
     def _arms(self, arms: Arms = SAME) -> Array:
-        """``(J_a Z)^T`` as it is now: calibration changes the moment arms."""
+        """``(J_a Z)^T``."""
         J_a = arms.of(self.reduction.actuation).detach().double().cpu().numpy()
         return (J_a @ self.joint_basis).T
 
