@@ -21,7 +21,7 @@ _BRINGS = {
     "mujoco": ("mujoco",),
     "dynamixel": ("dynamixel_sdk",),
     "ros2": ("rclpy", "sensor_msgs", "trajectory_msgs", "geometry_msgs", "std_msgs"),
-    "interop": ("onnx", "onnxscript", "casadi", "rosbags"),
+    "interop": ("casadi", "rosbags"),
 }
 _EXTRA_OF = {module: extra for extra, modules in _BRINGS.items() for module in modules}
 

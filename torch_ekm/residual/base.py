@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import pathlib
 import pickle
 import threading
 from abc import ABC, abstractmethod
@@ -200,26 +199,6 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         """
         x = self.check_query(x)
         return x.new_full((*x.shape[:-1], self.out_features, self.in_features), math.nan)
-
-    def export(self, path: str | pathlib.Path, *, format: Literal["onnx", "pt2"] = "pt2") -> pathlib.Path:
-        """Write what the learner predicts now to a file that other runtimes read, and return its path.
-
-        The input is ``x (n, in)``; the outputs are ``mean`` and latent ``variance`` ``(n, out)`` and their
-        derivatives ``mean_jacobian`` and ``variance_jacobian`` ``(n, out, in)``. What is learned later is
-        not in the file; where the learner goes on, see :func:`torch_ekm.interop.to_casadi`.
-
-        Args:
-            path: of the file.
-            format: ``"pt2"``, for ``torch.export.load`` and AOTInductor, or ``"onnx"`` (extra ``interop``).
-
-        Raises:
-            ParameterError: the learner has no closed-form Jacobians of mean and variance (a SparseOnlineGP
-                or a MixtureResidual of such has), or is a fleet; or an unknown format.
-            MissingExtraError: for ONNX, a package is missing.
-        """
-        from .export import export_learner  # torch's exporter is slow to import
-
-        return export_learner(self, path, format)
 
     # -- learning -----------------------------------------------------------------------------
 
