@@ -12,7 +12,7 @@ from .exceptions import MissingExtraError
 
 _BRINGS = {
     "robot": ("pytorch_kinematics", "yourdfpy", "trimesh", "coal", "qpsolvers", "clarabel", "scipy"),
-    "sim": ("sapien", "cv2", "gymnasium", "h5py", "filelock", "threadpoolctl"),
+    "sim": ("sapien", "cv2", "h5py", "filelock", "threadpoolctl"),
     "plots": ("matplotlib", "jinja2", "typer", "rich"),
     "experiments": ("joblib", "pandas", "pyvista"),
     "notebooks": ("IPython", "pyarrow"),
