@@ -113,8 +113,8 @@ def test_the_file_of_the_how_to_moves_a_hand(hand, tmp_path) -> None:
 
 def test_what_is_not_there_is_named(path, monkeypatch) -> None:
     monkeypatch.setattr("torch_ekm.drivers.ros2._TIMEOUT", 0.3)
-    path.write_text(TEXT.replace("[limits]", 'joint_states = "/none"\nreliable = true\n[limits]'))
-    with pytest.raises(BusError, match=r"/none: nothing is received: .*reliable = true"):
+    path.write_text(TEXT.replace("[limits]", 'joint_states = "/none"\n[limits]'))
+    with pytest.raises(BusError, match=r"/none: nothing is received: no node publishes it"):
         Ros2Plant(path)
     path.write_text(TEXT.replace("[limits]", 'kind = "velocity"\n[limits]'))
     with pytest.raises(DescriptionError, match=r"hand.toml:6: .*'kind' must be one of trajectory, array"):

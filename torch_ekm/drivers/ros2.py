@@ -22,7 +22,6 @@ from .wiring import Channel
 
 _TIMEOUT = 5.0  # [s] for the first message and the first subscriber: discovery takes a while
 _DISCOVERED = 0.4  # [s] by then a node that runs is known
-_ONLY_RELIABLE = "; [bus] reliable = true hears reliable publishers only"
 _POSE = ("x", "y", "z", "orientation.x", "orientation.y", "orientation.z", "orientation.w")
 _SYNCHRONOUS = 0.02  # [s] of clocks: less is not worth a note
 
@@ -40,8 +39,7 @@ class Ros2Plant(HandDriver):
         wiring: the TOML file; ids are names in the messages. ``[bus]``: ``joint_states`` ("/joint_states"),
             ``command`` (topic), ``kind`` ("trajectory": trajectory_msgs/JointTrajectory; "array":
             std_msgs/Float64MultiArray, in the description's order; "joint_state"), ``fingertips`` (a
-            std_msgs/Float64MultiArray, ids are places), ``reliable`` (false: hears all publishers; true: only
-            reliable ones, whose lost messages come again), ``use_sim_time``.
+            std_msgs/Float64MultiArray, ids are places), ``use_sim_time``.
         hand: its description; None: the one that the file names.
         options: see :class:`HandDriver`.
 
@@ -52,7 +50,7 @@ class Ros2Plant(HandDriver):
     """
 
     driver, unit, named = "ros2", "rad", True
-    keys = ("joint_states", "command", "kind", "fingertips", "reliable", "use_sim_time")
+    keys = ("joint_states", "command", "kind", "fingertips", "use_sim_time")
 
     def __init__(self, wiring: str | Path, hand: HandDescription | None = None, **options: Any) -> None:
         super().__init__(self.wired(wiring, hand), **options)
@@ -75,11 +73,8 @@ class Ros2Plant(HandDriver):
             parameters.append(require("rclpy.parameter").Parameter("use_sim_time", value=True))
         self.node = rclpy.create_node("torch_ekm", context=self._context, parameter_overrides=parameters)
         """For further subscriptions, such as :class:`RosPose`."""
-        policy = qos.ReliabilityPolicy
-        self._reliable = bus.flag("reliable", False)
-        self._quality = qos.QoSProfile(  # a depth of 1 would drop what two nodes send at once
-            depth=50, reliability=policy.RELIABLE if self._reliable else policy.BEST_EFFORT
-        )
+        # best effort hears all publishers; a depth of 1 would drop what two nodes send at once
+        self._quality = qos.QoSProfile(depth=50, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
         self._ids = [str(one.id) for one in (*self.wiring.motors, *self.wiring.joints)]
         self._states = self.gathered(bus.text("joint_states", "/joint_states"), self._ids)
         self.subscribe(states, self._states.topic, self._take)
@@ -137,7 +132,7 @@ class Ros2Plant(HandDriver):
     # -- what arrives -------------------------------------------------------------------------------
 
     def subscribe(self, kind: Any, topic: str, take: Callable[[Any, Any], None]) -> None:
-        """``take`` gets each message and its sender as the middleware states it, in the wiring's quality."""
+        """``take`` gets each message and its sender as the middleware states it, in a quality that hears all publishers."""
         informs = hasattr(require("rclpy.subscription").Subscription, "CallbackType")  # since ROS 2 Iron
         back = take if informs else lambda message: take(message, {})
         with _told(topic):
@@ -156,7 +151,7 @@ class Ros2Plant(HandDriver):
         said = gathered.absent(part, names)
         if not gathered.heard and (problem := self.lacks(gathered.topic, kind)):
             said += f": {problem}"
-        return said + (_ONLY_RELIABLE if self._reliable else "")
+        return said
 
     def publishers(self, topic: str) -> list[tuple[str, bytes]]:
         """Nodes that publish a topic, and by which id; names come a little later than messages."""
