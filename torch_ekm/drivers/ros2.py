@@ -132,7 +132,7 @@ class Ros2Plant(HandDriver):
     # -- what arrives -------------------------------------------------------------------------------
 
     def subscribe(self, kind: Any, topic: str, take: Callable[[Any, Any], None]) -> None:
-        """``take`` gets each message and its sender as the middleware states it, in a quality that hears all publishers."""
+        """``take`` gets each message and its sender as the middleware states it, of any publisher."""
         informs = hasattr(require("rclpy.subscription").Subscription, "CallbackType")  # since ROS 2 Iron
         back = take if informs else lambda message: take(message, {})
         with _told(topic):
