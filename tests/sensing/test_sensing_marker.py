@@ -178,5 +178,3 @@ def test_one_marker_alone_is_not_enough(pose_of, simulated, rng):
 def test_boards_must_be_told_apart():
     with pytest.raises(ParameterError, match="first_id"):
         MarkerTracker(PinholeCamera(), PALM, MarkerBoard(3))
-    with pytest.raises(ParameterError, match="dictionary"):
-        MarkerTracker(PinholeCamera(), PALM, MarkerBoard(4, dictionary="DICT_5X5_50"))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .._checks import check_positive
 from .._extras import require
-from ..exceptions import ParameterError, ShapeError, UnknownNameError
+from ..exceptions import ParameterError, ShapeError
 from ..typing import Array
 
 
@@ -60,29 +60,22 @@ class PinholeCamera:
 _TEXEL = 2.5e-4  # [m]
 
 
-def get_dictionary(name: str):
-    """OpenCV's predefined marker dictionary of that name, e.g. ``"DICT_4X4_50"``.
-
-    Raises:
-        UnknownNameError: OpenCV has no such dictionary.
-    """
+def dictionary():
+    """OpenCV's 50 markers of 4 x 4 bits."""
     aruco = require("cv2").aruco
-    valid = sorted(key for key in dir(aruco) if key.startswith("DICT_"))
-    if name not in valid:
-        raise UnknownNameError("marker dictionary", name, valid)
-    return aruco.getPredefinedDictionary(getattr(aruco, name))
+    return aruco.getPredefinedDictionary(aruco.DICT_4X4_50)
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerBoard:
-    """``rows x columns`` markers of edge ``marker_size`` [m], ``gap`` apart, on a white card.
+    """``rows x columns`` ArUco markers (4 x 4 bits) of edge ``marker_size`` [m], ``gap`` apart, on white.
 
     Board frame: origin at the centre of the card, x to the right, y up, **z out of the printed
     face**. Several coplanar markers determine the pose far better than one does: a single small
     square has two nearly equal solutions, and noise flips between them (Collins and Bartoli, IJCV 2014).
 
     Raises:
-        ParameterError: a size that is not positive, or more markers than the dictionary has.
+        ParameterError: a size that is not positive, or more markers than OpenCV's 50.
         ShapeError: ``mount`` is not ``(4, 4)``.
     """
 
@@ -94,7 +87,6 @@ class MarkerBoard:
     gap: float = 0.004
     margin: float = 0.004
     """Width of the white rim around the outer markers [m]."""
-    dictionary: str = "DICT_4X4_50"
     mount: Array = field(default_factory=lambda: np.eye(4), repr=False)
     """Pose of the board frame in the frame of the body that carries it, ``(4, 4)``."""
 
@@ -104,7 +96,7 @@ class MarkerBoard:
         object.__setattr__(self, "mount", np.array(self.mount, dtype=np.float64))
         if self.mount.shape != (4, 4):
             raise ShapeError("MarkerBoard.mount", "(4, 4)", self.mount.shape)
-        available = len(get_dictionary(self.dictionary).bytesList)
+        available = len(dictionary().bytesList)
         if self.first_id < 0 or self.first_id + self.n_markers > available:
             valid = f"within 0..{available - self.n_markers}"
             raise ParameterError("MarkerBoard.first_id", self.first_id, valid)
@@ -147,11 +139,10 @@ class MarkerBoard:
         puts the middle of the transition at the edge.
         """
         cv2 = require("cv2")
-        dictionary = get_dictionary(self.dictionary)
         width, height = self.size
         n_x, n_y = round(width / _TEXEL), round(height / _TEXEL)
         scale = np.array([n_x / width, n_y / height])  # texels per metre
-        cells = dictionary.markerSize + 2
+        cells = dictionary().markerSize + 2
         side = cells * max(1, round(self.marker_size / _TEXEL / cells))
         card = np.full((n_y, n_x), 255, dtype=np.uint8)
         for k, marker_id in enumerate(self.ids):
@@ -159,7 +150,7 @@ class MarkerBoard:
             ratio = self.marker_size * scale / side
             shift = upper_left + ratio / 2 - 0.5  # continuous coordinates: texel i has its centre at i + 0.5
             affine = np.array([[ratio[0], 0, shift[0]], [0, ratio[1], shift[1]]])
-            marker = cv2.aruco.generateImageMarker(dictionary, marker_id, side)
+            marker = cv2.aruco.generateImageMarker(dictionary(), marker_id, side)
             drawn = cv2.warpAffine(marker, affine, (n_x, n_y), borderValue=255)
             np.minimum(card, drawn, out=card)
         return card

@@ -14,7 +14,7 @@ from .._extras import require
 from ..exceptions import ObjectLostError, ParameterError, ShapeError
 from ..kinematics.poses import hat
 from ..typing import Array, Float, Tensor
-from .camera import MarkerBoard, PinholeCamera, get_dictionary
+from .camera import MarkerBoard, PinholeCamera, dictionary
 
 _CORNER_STD = 0.20  # of one coordinate of a detected corner [px]
 _MAX_RESIDUAL = 1.0  # a corner farther than this from the fitted board is left out [px]
@@ -197,7 +197,7 @@ def _half_width(camera: PinholeCamera, board: MarkerBoard, rotation: Array, posi
     Farther out, the blurred bits and neighbours would draw the edge towards themselves. Too narrow a
     look that ends on the slope is harmless: it is cut off alike on both sides.
     """
-    cells = 6.0  # of a marker of 4 x 4 bits and its rim; finer dictionaries come out a little narrower
+    cells = 6.0  # of a marker of 4 x 4 bits and its rim
     cosine = abs(rotation[:, 2] @ position) / np.linalg.norm(position)
     narrowest = min(board.marker_size / cells, board.gap, board.margin)
     width = 0.5 * narrowest * camera.fx / position[2] * max(float(cosine), 0.5)
@@ -321,17 +321,15 @@ class MarkerTracker:
             (``ObjectDescription.marker_transform``).
 
     Raises:
-        ParameterError: the two boards share markers, or are of different dictionaries.
+        ParameterError: the two boards share markers.
     """
 
     def __init__(self, camera: PinholeCamera, palm_board: MarkerBoard, object_board: MarkerBoard) -> None:
         if set(palm_board.ids) & set(object_board.ids):
             valid = f"beyond the palm's {palm_board.ids}"
             raise ParameterError("object_board.first_id", object_board.first_id, valid)
-        if palm_board.dictionary != object_board.dictionary:
-            raise ParameterError("object_board.dictionary", object_board.dictionary, palm_board.dictionary)
         self.camera, self.palm_board, self.object_board = camera, palm_board, object_board
-        self._detector = _make_detector(palm_board.dictionary)
+        self._detector = _make_detector()
         self.reset()
 
     def reset(self) -> None:
@@ -420,11 +418,11 @@ def _near(one: tuple[Array, Array], other: tuple[Array, Array]) -> bool:
     return bool(step <= _MAX_STEP and turn <= _MAX_TURN)
 
 
-def _make_detector(dictionary: str):
+def _make_detector():
     cv2 = require("cv2")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     # half the window in marker cells: 0.5 was the best of 0.3, 0.5, 0.7, 1.0 on 20 mm markers at 0.4 m
     parameters.relativeCornerRefinmentWinSize = 0.5
     parameters.cornerRefinementMinAccuracy = 0.01
-    return cv2.aruco.ArucoDetector(get_dictionary(dictionary), parameters)
+    return cv2.aruco.ArucoDetector(dictionary(), parameters)
