@@ -4,11 +4,10 @@
 f, the learners g, the root of the errors, :mod:`~torch_ekm.exceptions`. In the order in which data flows:
 :mod:`~torch_ekm.description`, :mod:`~torch_ekm.kinematics`, :mod:`~torch_ekm.contact`,
 :mod:`~torch_ekm.model`, :mod:`~torch_ekm.residual` (of any model), :mod:`~torch_ekm.enhanced`,
-:mod:`~torch_ekm.plant`, :mod:`~torch_ekm.control`,
-:mod:`~torch_ekm.sensing`, :mod:`~torch_ekm.simulation`, :mod:`~torch_ekm.rendering`,
-:mod:`~torch_ekm.foresight` (whole turns foreseen), :mod:`~torch_ekm.interop` (learners and files of other
-libraries), :mod:`~torch_ekm.experiments`, and ``torch_ekm.inspection``, which the
-commands ``check`` and ``show`` run and which exports nothing.
+:mod:`~torch_ekm.plant`, :mod:`~torch_ekm.control`, :mod:`~torch_ekm.sensing`, :mod:`~torch_ekm.simulation`,
+:mod:`~torch_ekm.rendering`, :mod:`~torch_ekm.interop` (learners and files of other libraries),
+:mod:`~torch_ekm.experiments`, and ``torch_ekm.inspection``, which exports nothing: it is what the
+commands ``check`` and ``show`` run.
 """
 
 from __future__ import annotations

@@ -78,8 +78,9 @@ class PrequentialLoss(nn.Module):
 
     def snapshot(self, posterior: SparsePosterior) -> None:
         """The present state becomes the past one."""
-        for old, new in zip(self.state._buffers.values(), posterior._buffers.values(), strict=True):
-            old.copy_(new)  # .buffers() takes longer than to copy them
+        own = self.state.buffers(recurse=False), posterior.buffers(recurse=False)
+        for old, new in zip(*own, strict=True):
+            old.copy_(new)
 
     def forward(self, kernel: Kernel, log_noise: Tensor, queries: Queries, *, anew: bool = False) -> Tensor:
         """Loss of each model ``(*batch_shape)`` [nats per sample and output], for autograd to go through.

@@ -6,7 +6,7 @@ import copy
 import hashlib
 import itertools
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, NamedTuple
@@ -134,10 +134,10 @@ def remembered_pinch(problem: PinchProblem, request: PinchRequest) -> PinchPlan:
     return copy.deepcopy(_plans[key])
 
 
-def solve(problem: PinchProblem, request: PinchRequest) -> Solution:
+def solve(problem: PinchProblem, request: PinchRequest, guesses: Iterable[Array] | None = None) -> Solution:
     """The first good solution, or the best from all first guesses."""
     best = Solution(np.zeros(0), np.inf, np.inf, np.inf, 0.0)
-    for guess in _guesses(problem, request):
+    for guess in _guesses(problem, request) if guesses is None else guesses:
         found = descend(problem, request, guess, ranges=False)
         if found.violation <= 1 and found.outside > 0:
             found = descend(problem, request, found.x, ranges=True)
