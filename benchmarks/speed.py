@@ -213,8 +213,9 @@ def measure(quick: bool) -> Speed:
         # a quick run takes the loops that are there: to compile them is long
         environment = dict(os.environ) if quick else {**os.environ, "NUMBA_CACHE_DIR": cache}
         times |= of_start(environment, "fresh installation")
-        warm = "import torch_ekm; torch_ekm.warm_up()"
-        subprocess.run([sys.executable, "-c", warm], env=environment, check=True)
+        if not quick:
+            warm = "import torch_ekm; torch_ekm.warm_up()"
+            subprocess.run([sys.executable, "-c", warm], env=environment, check=True)
         times |= of_start(environment, "fresh process")
     sizes = (10, 20) if quick else (10, 30, 100, 300)
     return Speed(times, sizes, by_size(sizes, 1 if quick else 3, 0.01 if quick else 0.3), plain)

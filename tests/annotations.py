@@ -1,10 +1,8 @@
-"""Shape annotations are checked in the first hundreds of calls of each test.
+"""Shape annotations are checked in the first hundred calls of each test.
 
 :mod:`jaxtyping` binds the sizes of a call to each other; :mod:`beartype` checks types. ``int`` is taken where
 ``float`` is annotated, as type checkers do (PEP 484).
 """
-
-from __future__ import annotations
 
 import functools
 import os
@@ -16,7 +14,7 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 #: Checks of one test; the rest of its calls, most of them in long streams, repeat the same shapes.
-BUDGET = 300
+BUDGET = 100
 #: Packages whose annotations are checked.
 CHECKED: tuple[str, ...] = ("kinematics", "contact", "model", "residual", "enhanced", "control")
 

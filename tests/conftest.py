@@ -1,19 +1,26 @@
 """Settings that all tests share."""
 
-from __future__ import annotations
-
 import gc
 import os
+import sys
 from collections.abc import Iterator
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import annotations as shapes  # beside this file
-import coarse_time
 import hypothesis
 import jaxtyping
 import pytest
 import torch
+
+_EXACT = (
+    "test_benchmarks_drivers.py",  # so has the hand behind the bus
+    "test_description_docs.py",  # figures are found within 10 %
+    "test_simulation_hand.py",
+    "test_simulation_model_agreement.py",
+    "test_simulation_sensor_disturbances.py",
+)
 
 shapes.install()  # before anything imports the package
 torch.set_num_threads(1)  # many small matrices: threads only get into each other's way
@@ -39,8 +46,21 @@ def generator() -> torch.Generator:
 
 @pytest.fixture(autouse=True, scope="module")
 def _coarse_time(request: pytest.FixtureRequest) -> Iterator[None]:
-    with coarse_time.steps_for(request.path.name):
+    """Hands are simulated in steps of 2 ms, which takes half the time of the usual 1 ms.
+
+    Tests of the simulated hand itself, and of the model against it, have the usual steps, and so has what
+    runs in a process of its own.
+    """
+    module: Any = sys.modules.get("torch_ekm.simulation.config")  # if a collected test has it
+    if module is None or request.path.name in _EXACT:
         yield
+        return
+    init = module.PlantConfig.__init__
+    usual = init.__defaults__
+    init.__defaults__ = tuple(0.002 if value == 1e-3 else value for value in usual)
+    assert module.PlantConfig().time_step == 0.002
+    yield
+    init.__defaults__ = usual
 
 
 @pytest.fixture(autouse=True)

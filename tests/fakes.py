@@ -1,7 +1,5 @@
 """Plants with nothing behind them, for tests of what is put around a plant or drives one."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 

@@ -1,7 +1,5 @@
 """A trial that was never run: what every sensor said, with raw counts, an image and events."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Files of a hand or an object as its owner has them: copies of the package's own, to be changed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from torch_ekm.description import list_hands

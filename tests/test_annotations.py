@@ -1,7 +1,5 @@
 """A wrong shape raises while the tests run, in each package whose annotations are checked."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """The examples of README do what the text around them says."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A controller of few lines that turns a held object, for tests of what a model predicts."""
 
-from __future__ import annotations
-
 import torch
 
 from torch_ekm.kinematics import GraspState

@@ -1,12 +1,6 @@
 """The benchmark of broken tendons runs, and finds them."""
 
-from __future__ import annotations
-
 import sys
-
-import pytest
-
-pytest.importorskip("mujoco", reason="extra 'mujoco'")
 
 
 def test_broken_tendons_are_found(monkeypatch, capsys) -> None:

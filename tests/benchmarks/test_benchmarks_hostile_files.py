@@ -1,7 +1,5 @@
 """Files that are damaged or made to do harm; the benchmark has more of them, and watches who reads them."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The matrix of trials: hands, contenders, what is counted, and that every question runs and resumes."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import sys
@@ -10,14 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
-pytest.importorskip("matrix", reason="the benchmarks are not part of this installation")
-pytest.importorskip("mujoco")
 sys.path.append(str(Path(__file__).parents[1] / "experiments"))
 
 import matrix
 from contenders import BEGINNINGS, PARTS, PLANS, PRINTED, READINGS, WHOLE_TURNS, MisprintedBench
-from experiments_records import frame
 from hands import CONDITIONS, FAMILIES, OTHERS, STRENGTHS, hands
+from made_up_sessions import frame
 from matrix import FIGURES, bands_table, ends_table, verdict
 from questions import QUESTIONS
 from sessions import TARGETS, Part, target_of
@@ -123,7 +119,6 @@ def test_the_misprinted_stiffness_is_the_papers_letter_by_letter() -> None:
     one = PRINTED["KM, J_m as misprinted"]
     bench = MisprintedBench(one.setting(Setting(engine="mujoco")), "box", "KM")
     state = bench.grasp(3, 0)
-    assert state is not None
     kin = bench.model.contact_kinematics(state, bench.model.contacts(state))
     random = torch.Generator().manual_seed(0)
     force = torch.randn(len(kin.point_jacobian), 3, generator=random, dtype=torch.float64)
@@ -156,7 +151,9 @@ def test_a_question_runs_and_what_is_done_is_kept(tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.parametrize("name", ["generalize", "series", "directions", "printed", "new_object", "slides"])
-def test_every_kind_of_session_runs(name: str, tmp_path: Path) -> None:
+def test_every_kind_of_session_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runner, "_MOTIONS", 3)
+    monkeypatch.setitem(TARGETS, "shift 3 mm", TARGETS["shift 3 mm"][:2])
     asked = QUESTIONS[name]
     made = matrix.ask(asked, ["--quick", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)])
     assert all(len(table.rows) for table in made.tables)

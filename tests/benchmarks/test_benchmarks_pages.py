@@ -1,7 +1,5 @@
 """Pages of measured figures: commands exist, what was measured is kept, and a page says how it was made."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import re
@@ -9,9 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("write_pages", reason="the benchmarks are not part of this installation")
-
 import write_pages
 from dots import dot_chart
 from write_pages import Section, page_text
@@ -63,9 +58,7 @@ def test_a_page_keeps_what_was_measured_and_says_how(tmp_path: Path, monkeypatch
     assert "| 2 ['--other', '--quick'] |" in (out / "one.md").read_text(encoding="utf-8")
 
 
-def test_half_a_result_of_another_commit_is_not_gone_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_half_a_result_of_another_commit_is_not_gone_on_with(tmp_path, monkeypatch):
     script = tmp_path / "resume.py"
     script.write_text(  # the file of Report.write alone: its import would take seconds
         "import pathlib, sys\n"
@@ -89,9 +82,7 @@ def test_an_unknown_page_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert "no page nothing; there are paper" in capsys.readouterr().err
 
 
-def test_a_report_comes_with_its_headings_below_the_pages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_comes_with_its_headings_below_the_pages(tmp_path, monkeypatch):
     script = tmp_path / "report.py"
     script.write_text(
         "import pathlib, sys\n"

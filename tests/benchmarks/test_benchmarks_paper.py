@@ -1,15 +1,10 @@
 """The page of the paper's numbers: a row for each, from made-up sessions."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
-import pytest
-
 sys.path.append(str(Path(__file__).parents[1] / "experiments"))
 
-pytest.importorskip("paper", reason="the benchmarks are not part of this installation")
 
 from made_up_sessions import made_up_generalize, made_up_online
 

@@ -1,13 +1,10 @@
 """GPyTorch behind the contract of learners."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
 
 def test_gpytorch_learns(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("gpytorch")
     import gpytorch_svgp
 
     monkeypatch.setattr(gpytorch_svgp, "_RATE", 0.05)

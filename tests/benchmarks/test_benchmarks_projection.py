@@ -1,16 +1,11 @@
 """Noisy states are put into contact: half of the raw ones cannot be modelled, all projected ones can."""
 
-from __future__ import annotations
-
 import functools
 import math
 
 import numpy as np
 import pytest
 import torch
-
-pytest.importorskip("coal")
-
 from recorded_hand.projection import project_onto_contacts
 
 from torch_ekm._arrays import null_space

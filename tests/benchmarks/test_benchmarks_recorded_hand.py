@@ -1,7 +1,5 @@
 """The benchmark on a recorded hand, on a synthetic recording of the same format."""
 
-from __future__ import annotations
-
 import math
 import os
 import runpy
@@ -209,12 +207,15 @@ def test_the_synthetic_recording_is_the_same_each_time(tmp_path):
         np.testing.assert_array_equal(first[name], second[name])
 
 
-def test_command_line_runs_without_data(folder, tmp_path, monkeypatch, capsys):
-    place = str(Path(recorded_hand.benchmark.__file__).parent)
+def test_command_line_runs_without_data(folder, result, tmp_path, monkeypatch, capsys):
+    place, asked = str(Path(recorded_hand.benchmark.__file__).parent), []
     monkeypatch.setattr(recorded_hand.benchmark, "write_synthetic", lambda _: folder)
+    predict = lambda *what, **how: asked.append((what, how)) or result  # noqa: E731
+    monkeypatch.setattr(recorded_hand.benchmark, "predict_recorded_hand", predict)
     options = ["--quick", "--jobs", "1", "--learners", "linear RLS", "--out", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [place, *options])
     runpy.run_path(place, run_name="__main__")
+    assert asked == [((None,), {"learners": ("linear RLS",), "processes": 1, "quick": True})]
     assert "KM, published figures" in capsys.readouterr().out
     assert (tmp_path / "index.html").stat().st_size > 5_000
 

@@ -1,14 +1,6 @@
 """The paper's sensing, in simulation: that a reading can be replaced by the truth, and that it runs."""
 
-from __future__ import annotations
-
 from pathlib import Path
-
-import pytest
-
-pytest.importorskip("matrix", reason="the benchmarks are not part of this installation")
-pytest.importorskip("cv2")
-pytest.importorskip("mujoco")
 
 import matrix
 from questions import QUESTIONS

@@ -1,13 +1,6 @@
 """Contacts that slide, open and close: what is counted, and what the witness sees."""
 
-from __future__ import annotations
-
 import pandas
-import pytest
-
-pytest.importorskip("slides", reason="the benchmarks are not part of this installation")
-pytest.importorskip("mujoco")
-
 from slides import Witness, errors_table, told
 
 from torch_ekm.simulation import SimulatedHand

@@ -1,23 +1,13 @@
 """The table of speeds: that it runs, and what it says of times that are given."""
 
-from __future__ import annotations
-
 import re
-import shutil
 from pathlib import Path
 
+import bench_learners
 import numpy as np
 import pytest
-import torch
-
-pytest.importorskip("sapien")
-pytest.importorskip("gpytorch")
-pytest.importorskip("river")
-pytest.importorskip("numba")
-pytest.importorskip("speed", reason="the benchmarks are not part of this installation")
-
-import bench_learners
 import speed
+import torch
 
 from torch_ekm.residual.sparse_gp.engine import recursion
 
@@ -36,7 +26,6 @@ def test_what_is_said_of_times() -> None:
     assert said == expected
 
 
-@pytest.mark.slow
 def test_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     speed.main(["--quick", "--out", str(tmp_path)])
     last = capsys.readouterr().out.splitlines()[-1]
@@ -49,7 +38,6 @@ def test_it_runs(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert np.finfo(float).tiny / np.array([4.0]) > 0  # subnormal numbers are as they were
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler")
 def test_plain_c_gives_the_same_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     reference = bench_learners.PlainC(30, 6)
     xs, ys = bench_learners.stream(40, 6, seed=5)

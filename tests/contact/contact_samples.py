@@ -1,7 +1,5 @@
 """Contacts on a ball of radius 30 mm, held by fingers that are just joints in space."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import torch

@@ -1,7 +1,5 @@
 """Grasp matrices, ranks and quality against figures known from the theory."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from contact_samples import F64, RADIUS, THREE, ball_contacts, held

@@ -1,7 +1,5 @@
 """Every learner keeps the contract, in both precisions and all query shapes; broken ones are caught."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import sys
@@ -41,11 +39,11 @@ pytestmark = pytest.mark.usefixtures("unchecked")  # the contract gives input th
 def deep(dtype=torch.float64, **options):
     base = SquaredExponential(3, batch_shape=options.get("batch_shape", ()))
     options = {"parts": [Standardize(), LearnHyperparameters()], "refresh_every": 4, **options}
-    return SparseOnlineGP(3, 2, capacity=8, kernel=DeepKernel(base, hidden=(8,)), dtype=dtype, **options)
+    return SparseOnlineGP(3, 2, capacity=6, kernel=DeepKernel(base, hidden=(8,)), dtype=dtype, **options)
 
 
 def sogp(**options):
-    return SparseOnlineGP(3, 2, **{"capacity": 8, **options})
+    return SparseOnlineGP(3, 2, **{"capacity": 6, **options})
 
 
 LEARNERS = {
@@ -55,8 +53,8 @@ LEARNERS = {
     "mlp": lambda **o: ReplayMLP(3, 2, hidden=(8,), **o),
     "ensemble": lambda **o: ReplayMLP(3, 2, hidden=(8,), members=3, **o),
     "sogp": sogp,
-    "default": lambda **o: default_learner(3, 2, capacity=8, **o),
-    "linear": lambda **o: SparseOnlineGP(3, 2, capacity=8, kernel=LinearKernel(3), **o),
+    "default": lambda **o: default_learner(3, 2, capacity=6, **o),
+    "linear": lambda **o: SparseOnlineGP(3, 2, capacity=6, kernel=LinearKernel(3), **o),
     "rls_as_given": lambda **o: RecursiveLeastSquares(3, 2, standardize=False, **o),
     "sogp_all": lambda **o: sogp(
         refresh_every=4,
@@ -78,7 +76,7 @@ LEARNERS = {
         [sogp(parts=[ProcessNoise(0.01)], **o), RecursiveLeastSquares(3, 2, **o)], levels=(0.0, 0.1)
     ),
     "deep": deep,
-    "deep_sogp": lambda **o: DeepKernelSOGP(3, 2, capacity=8, hidden=(8,), refresh_every=4, **o),
+    "deep_sogp": lambda **o: DeepKernelSOGP(3, 2, capacity=6, hidden=(8,), refresh_every=4, **o),
 }
 FLEETS = ("zero", "rls", "rff", "sogp", "sogp_all", "sogp_process_noise", "mixture_of_two", "deep")
 
@@ -86,7 +84,7 @@ FLEETS = ("zero", "rls", "rff", "sogp", "sogp_all", "sogp_process_noise", "mixtu
 @pytest.mark.parametrize("name", LEARNERS)
 def test_contract(name):
     # a single network cannot tell its own error from noise; the default learner is three in one
-    n_samples = 12 if name == "default" else 16  # twice the capacity of the others
+    n_samples = 10 if name == "default" else 12  # twice the capacity of the others
     check_residual_learner(LEARNERS[name], n_samples=n_samples, separates_noise=name != "mlp")
 
 
@@ -99,12 +97,11 @@ def test_contract(name):
 )
 def test_contract_of_fleets(name, shape):
     check_residual_learner(
-        lambda **o: LEARNERS[name](batch_shape=shape, **o), dtypes=(torch.float64,), n_samples=16
+        lambda **o: LEARNERS[name](batch_shape=shape, **o), dtypes=(torch.float64,), n_samples=12
     )
 
 
 def test_contract_of_river():
-    pytest.importorskip("river")
     from torch_ekm.interop import RiverResidual
 
     options = {"differentiable": False, "separates_noise": False, "has_state": False}
@@ -136,8 +133,6 @@ def test_the_decision_table_names_learners_that_can_be_made():
 
 def _page(name):
     page = Path(__file__).parents[2] / "docs" / "how_to" / f"{name}.md"
-    if not page.is_file():
-        pytest.skip("the documentation is not part of this installation")
     return page.read_text(encoding="utf-8")
 
 

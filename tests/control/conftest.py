@@ -1,29 +1,30 @@
-"""Grasps that tests of the controller begin with."""
+"""Grasps that tests of the controller begin with; no test moves their hands."""
 
-from __future__ import annotations
+import functools
 
 import pytest
 
-from torch_ekm.kinematics import GraspState
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import SimulatedHand
 
 
-@pytest.fixture(scope="module")
+@functools.cache  # in a fixture of a session steps would be the usual ones
+def _held(seed: int):
+    plant = SimulatedHand("icub_right", "box")
+    seen = plant.reset(seed=seed)
+    return plant, KinematicModel(plant.hand, plant.object), seen
+
+
+@pytest.fixture
 def grasp():
     """A held box: plant, kinematic model, first observation and its state."""
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=3)
-    model = KinematicModel(plant.hand, plant.object)
-    return plant, model, seen, GraspState(seen.q, seen.position, seen.rotation)
+    return *_held(3), _held(3)[2].state
 
 
 @pytest.fixture(scope="module")
 def pinch():
     """Another: plant, kinematic model, first observation."""
-    plant = SimulatedHand("icub_right", "box")
-    seen = plant.reset(seed=4)
-    return plant, KinematicModel(plant.hand, plant.object), seen
+    return _held(4)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """What tests of the loop do with a plant that obeys a kinematic model."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """How sure a model is of where a movement leads, and how far motions end from that."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

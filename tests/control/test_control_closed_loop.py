@@ -1,7 +1,5 @@
 """The closed loop on plants that misbehave."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import threading
@@ -63,7 +61,7 @@ def held(pinch):
     return seen, plant.rotation_axis, LookAndMoveController(model, plant.rotation_axis)
 
 
-def drive(held, change=None, angle: float = 80.0, rule: StoppingRule = RULE):
+def drive(held, change=None, angle: float = 20.0, rule: StoppingRule = RULE):
     seen, axis, loop = held
     plant = FrozenPlant(seen, change)
     assert isinstance(plant, Plant)
@@ -77,7 +75,7 @@ def drive(held, change=None, angle: float = 80.0, rule: StoppingRule = RULE):
 def test_target_that_cannot_be_reached_stalls_and_says_so(held, window, motions, reason) -> None:
     done, plant = drive(held, rule=dataclasses.replace(RULE, stall_window=window))
     assert done.reason is reason
-    assert done.errors[-1] == pytest.approx(80 * DEG)
+    assert done.errors[-1] == pytest.approx(20 * DEG)
     assert plant.commands == len(done.steps) == motions
 
 
@@ -168,7 +166,7 @@ def test_swapped_arguments_and_angles_as_targets_are_refused(held) -> None:
 def test_steps_are_a_generator_that_tells_why_it_ends(held) -> None:
     seen, axis, loop = held
     plant = FrozenPlant(seen)
-    motions = ClosedLoop(plant, loop, safety=SAFETY).steps(PoseTarget.turned(seen.state, axis, degrees=80))
+    motions = ClosedLoop(plant, loop, safety=SAFETY).steps(PoseTarget.turned(seen.state, axis, degrees=20))
     first = next(motions)
     assert plant.commands == 1  # nothing runs ahead of its consumer
     assert first.before.q is seen.q
@@ -183,7 +181,7 @@ def test_steps_are_a_generator_that_tells_why_it_ends(held) -> None:
 
 def test_an_enhanced_model_learns_unless_seen_motions_not_to(held) -> None:
     seen, axis, loop = held
-    target = PoseTarget.turned(seen.state, axis, degrees=80)
+    target = PoseTarget.turned(seen.state, axis, degrees=20)
     for learn in (True, False):
         ekm = EnhancedModel.for_grasp(loop.kinematic, seen.state)
         controller = LookAndMoveController(ekm, axis)
@@ -203,7 +201,7 @@ def test_an_object_that_is_lost_teaches_nothing(held) -> None:
     seen, axis, loop = held
     controller = LookAndMoveController(EnhancedModel.for_grasp(loop.kinematic, seen.state), axis)
     plant = FrozenPlant(seen, lambda o: dataclasses.replace(o, status=PlantStatus.LOST))
-    done = ClosedLoop(plant, controller, safety=SAFETY).run(PoseTarget.turned(seen.state, axis, degrees=80))
+    done = ClosedLoop(plant, controller, safety=SAFETY).run(PoseTarget.turned(seen.state, axis, degrees=20))
     assert done.reason is Reason.OBJECT_LOST
     assert done.lost
     assert [step.report is not None for step in done.steps] == [True, False]
@@ -226,7 +224,7 @@ def test_the_learner_is_seen_motions_what_the_encoders_did(held) -> None:
     controller = LookAndMoveController(ekm, axis)
     knowledge = HandKnowledge.of(loop.kinematic.hand, adapts=False)
     driven = ClosedLoop(Half(seen), controller, knowledge=knowledge, safety=SAFETY, planner=OneStep())
-    steps = driven.run(PoseTarget.turned(seen.state, axis, degrees=80)).steps
+    steps = driven.run(PoseTarget.turned(seen.state, axis, degrees=20)).steps
     for (da, nominal), step in zip(seen_motions, [s for s in steps if s.report is not None], strict=True):
         torch.testing.assert_close(da, step.after.a - step.before.a)
         torch.testing.assert_close(nominal, step.decision.linearization.step(da))
@@ -259,7 +257,7 @@ def test_a_plant_that_fails_before_the_first_reading_raises(held) -> None:
             raise OSError("no such port")
 
     with pytest.raises(OSError, match="no such port"):
-        ClosedLoop(Dead(seen), controller).run(PoseTarget.turned(seen.state, axis, degrees=80))
+        ClosedLoop(Dead(seen), controller).run(PoseTarget.turned(seen.state, axis, degrees=20))
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("bus is down")])
@@ -267,7 +265,7 @@ def test_the_hand_holds_after_an_error_of_the_driver_and_after_ctrl_c(held, erro
     seen, axis, controller = held
     plant = Noted(seen, error)
     with ClosedLoop(plant, controller, safety=SAFETY) as loop:
-        done = loop.run(PoseTarget.turned(seen.state, axis, degrees=80))
+        done = loop.run(PoseTarget.turned(seen.state, axis, degrees=20))
         assert not plant.closed
     assert plant.closed
     assert done.stop.cause is error
@@ -280,7 +278,7 @@ def test_the_hand_holds_after_an_error_of_the_driver_and_after_ctrl_c(held, erro
 
 def test_the_hand_holds_after_an_error_of_the_caller_and_after_a_break(held) -> None:
     seen, axis, controller = held
-    target = PoseTarget.turned(seen.state, axis, degrees=80)
+    target = PoseTarget.turned(seen.state, axis, degrees=20)
 
     def fail(step) -> None:
         raise ZeroDivisionError
@@ -320,7 +318,7 @@ def test_another_thread_stops_it_after_the_motion_under_way(held) -> None:
         worker.start()
         worker.join()  # on a busy machine it may come late
 
-    done = watched(loop, PoseTarget.turned(seen.state, axis, degrees=80), stop)
+    done = watched(loop, PoseTarget.turned(seen.state, axis, degrees=20), stop)
     assert done.reason is Reason.STOPPED
     assert len(done.steps) <= 2
-    assert loop.run(PoseTarget.turned(seen.state, axis, degrees=80)).reason is Reason.STALLED  # and again
+    assert loop.run(PoseTarget.turned(seen.state, axis, degrees=20)).reason is Reason.STALLED  # and again

@@ -1,7 +1,5 @@
 """The controller on the kinematic model of the simulated hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -214,15 +212,6 @@ def test_joints_stop_before_their_stops(grasp) -> None:
     kept = controller(grasp, limits=(ActuatorLimit(), NormalForceLimit(), JointLimit(margin)))
     decision = kept.decide(state, seen.a, target, seen.fingertip_force)
     assert float(state.q[joint] + decision.predicted[joint]) <= stop + 1e-6
-
-
-def test_limiting_function_keeps_direction() -> None:
-    limiting = LimitingFunction(gain=0.5, step=1.0, contact_travel=2e-3)
-    error = torch.tensor([3.0, -4.0])
-    torch.testing.assert_close(limiting(error), error / 5)
-    torch.testing.assert_close(limiting(error / 10), error / 20)
-    torch.testing.assert_close(limiting(error * 0), error * 0)
-    torch.testing.assert_close(limiting(error, travel=20e-3), error / 10)
 
 
 def test_no_contact_is_asked_to_travel_far(grasp) -> None:

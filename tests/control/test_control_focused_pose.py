@@ -1,7 +1,5 @@
 """A focused pose of several directions with units: errors, steps, weights, and what is reachable."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

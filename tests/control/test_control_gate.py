@@ -1,7 +1,5 @@
 """What a loop sends to its plant, learns, and says, when readings lie, and when it is not alone."""
 
-from __future__ import annotations
-
 import concurrent.futures
 import copy
 import dataclasses
@@ -67,7 +65,7 @@ def test_a_hand_that_is_well_again_turns_whatever_was_believed_of_its_servos(hel
         reasons = []
         for _ in range(2):
             plant = Obedient(held[2], held[0])
-            reasons.append(turn(held, plant, knowledge=knowledge)[1].reason)
+            reasons.append(turn(held, plant, 10.0, knowledge=knowledge)[1].reason)
             assert max(float(v.abs().max()) for v in plant.given) <= Guards().increment
         assert reasons[-1] is Reason.REACHED, (bias, reasons)
         assert float(knowledge.servo.bias.abs().max()) < 0.5 * DEG
@@ -295,9 +293,7 @@ def shifted(state):
 
 
 @pytest.mark.parametrize("name", WHY_NOT)
-def test_a_turn_that_cannot_be_gone_on_with_is_refused_and_nothing_is_taken_over(
-    held, tmp_path, name
-) -> None:
+def test_a_turn_that_cannot_be_gone_on_with_is_refused_and_nothing_is_taken_over(held, tmp_path, name):
     journal, loop = journal_of(held, tmp_path)
     plant = loop.plant.plant.plant
     WHY_NOT[name][0](plant)
@@ -309,9 +305,7 @@ def test_a_turn_that_cannot_be_gone_on_with_is_refused_and_nothing_is_taken_over
     assert int(again.knowledge.figures.count) == 0
 
 
-def test_what_another_learner_learned_is_refused_and_nothing_of_the_rest_is_taken_over(
-    held, tmp_path
-) -> None:
+def test_what_another_learner_learned_is_refused_and_nothing_of_the_rest_is_taken_over(held, tmp_path):
     journal, loop = journal_of(held, tmp_path)
     ekm = EnhancedModel.for_grasp(held[2], held[0].state, RecursiveLeastSquares(26, 6))
     again = ClosedLoop(loop.plant.plant.plant, LookAndMoveController(ekm, held[1]))
@@ -320,15 +314,6 @@ def test_what_another_learner_learned_is_refused_and_nothing_of_the_rest_is_take
         journal.resume(again)
     after = again.learned.state_dict()
     assert all(torch.equal(value, after[name]) for name, value in before.items() if "knowledge" in name)
-
-
-def test_a_file_that_is_no_journal_is_refused(held, tmp_path) -> None:
-    loop = loop_of(held, Obedient(held[2], held[0]))
-    with pytest.raises(ResumeError, match="no such file"):
-        Journal(tmp_path / "turn.ekm").resume(loop)
-    loop.knowledge.save(tmp_path / "hand.ekm")
-    with pytest.raises(FileFormatError, match="no journal"):
-        Journal(tmp_path / "hand.ekm").resume(loop)
 
 
 def edited(path: Path, change) -> None:
@@ -360,11 +345,15 @@ def test_a_journal_of_another_version_is_refused_and_nothing_is_taken_over(held,
     assert all(torch.equal(again.learned.state_dict()[k], v) for k, v in before.items())
 
 
-def test_a_file_that_is_no_journal_is_not_written_over(held, tmp_path) -> None:
+def test_a_file_that_is_no_journal_is_neither_read_nor_written_over(held, tmp_path) -> None:
     """What was learned of the hand is in such a file, too."""
     loop, path = loop_of(held, Obedient(held[2], held[0])), tmp_path / "hand.ekm"
+    with pytest.raises(ResumeError, match="no such file"):
+        Journal(path).resume(loop)
     loop.knowledge.save(path)
     kept = path.read_bytes()
+    with pytest.raises(FileFormatError, match="no journal"):
+        Journal(path).resume(loop)
     with pytest.raises(FileFormatError, match="no journal of a turn"):
         Journal(path).run(loop, PoseTarget.turned(held[0].state, held[1], degrees=20))
     assert path.read_bytes() == kept

@@ -1,7 +1,5 @@
 """What a closed loop believes of its sensors, where it ends, and what a guard leaves untouched."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -268,7 +266,6 @@ def test_a_clock_that_goes_back_at_rest_is_named(held) -> None:
     seen, _, model = held
     earlier = dataclasses.replace(seen, time=seen.time - 0.1, stamps=None)
     said = ReadingTests(Guards(), model.hand).at_rest(earlier, dataclasses.replace(seen, stamps=None))
-    assert said is not None
     assert said.reason is Reason.STALE_SENSOR
     assert "the clock went back from" in said.message
 

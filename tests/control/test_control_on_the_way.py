@@ -1,7 +1,5 @@
 """What is watched during a movement, and the looks that decide whether a target is reached."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

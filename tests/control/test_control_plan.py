@@ -1,7 +1,5 @@
 """A turn as one movement: its path on the model, and how far along it is safe."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import math
@@ -114,9 +112,7 @@ def test_a_piece_in_which_a_pad_slides_is_chosen_about_where_it_leads(held, slip
     assert controller.focus.off_rotation(path[-1].minus(seen.state)) < 0.2 * DEG
 
 
-def test_a_grasp_that_its_forces_make_soft_is_gripped_no_harder(
-    held, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_grasp_that_its_forces_make_soft_is_gripped_no_harder(held, monkeypatch):
     seen, axis, model = held
     controller = LookAndMoveController(
         model, axis, tasks=[EffortTask(), GripForceTask(force=8.0), FocusTask()]

@@ -1,7 +1,5 @@
 """The controller's quadratic program."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -27,10 +25,6 @@ def test_weighted_least_norm_step() -> None:
     solution = solve()
     np.testing.assert_allclose(solution.u, [0.05, 0.025], atol=1e-8)
     np.testing.assert_allclose(solution.slack, 0, atol=1e-8)
-
-
-def test_zero_error_gives_zero_command() -> None:
-    np.testing.assert_allclose(solve(d=0.0).u, 0, atol=1e-10)
 
 
 def test_unreachable_target_goes_to_the_bounds_and_says_so() -> None:

@@ -1,7 +1,5 @@
 """How far a grasp can be turned, by the model: against the simulated hand without mismatch."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Where the model refuses a state, the sensors that contradict each other are named."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -69,7 +67,7 @@ def test_fingertips_that_read_too_little_are_told_until_they_are_known_to(held) 
             return dataclasses.replace(seen, fingertip_force=scale * seen.fingertip_force)
 
         loop = untaught(held, scaled, since=0, knowledge=knowledge)
-        return loop.run(PoseTarget.turned(seen.state, axis, degrees=8))
+        return loop.run(PoseTarget.turned(seen.state, axis, degrees=4))
 
     known, told = [], []
     for scale in (0.4, 0.4, *[1.0] * 8, 0.4):
@@ -96,8 +94,8 @@ def test_readings_without_a_date_are_told_once(held) -> None:
 
 @pytest.mark.parametrize(("by_joints", "told"), [(0.4, False), (1.5, True), (3.0, False), (9.0, True)])
 def test_joints_that_say_nothing_of_forces_do_not_contradict_the_fingertips(
-    held, monkeypatch: pytest.MonkeyPatch, by_joints: float, told: bool
-) -> None:
+    held, monkeypatch, by_joints, told
+):
     """Joints without springs behind rigid motors give next to nothing, whatever the pads press with."""
     tests = watch_of(held[2]).fingertips
     monkeypatch.setattr(tests, "_by_joints", lambda seen: {0: by_joints, 1: by_joints})

@@ -1,7 +1,5 @@
 """What a loop calls answers a wrong kind with the package's error, and nothing has changed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

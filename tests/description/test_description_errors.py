@@ -1,7 +1,5 @@
 """Wrong files: each error is typed, names the file and the place, and says what would be right."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import re

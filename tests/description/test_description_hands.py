@@ -1,7 +1,5 @@
 """The hands that come with the package: counts, figures, consistency of URDF and transmission."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys
@@ -9,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from own_files import change, copied
 
 from torch_ekm.description import list_hands, load_hand, load_object, registry
 from torch_ekm.description.registry import urdf_folder
 from torch_ekm.exceptions import DescriptionError, EKMError, UnknownNameError
+from torch_ekm.kinematics import HandKinematics
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 
@@ -74,9 +74,6 @@ def test_icub_weighs_what_its_cad_says(side: str) -> None:
     Source: icub-models, iCubGenova02, link r_hand. The shares of palm and fingers
     were derived from it, so a few mm is what they can be asked for.
     """
-    torch = pytest.importorskip("torch")
-    from torch_ekm.kinematics import HandKinematics
-
     hand = load_hand(f"icub_{side}")
     poses = HandKinematics(hand)(torch.zeros(20, dtype=torch.float64))
     mass = sum(link.mass for link in hand.urdf.links)
@@ -154,9 +151,6 @@ def test_data_of_an_installed_package(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_t42_has_its_published_figures() -> None:
     """Straight fingers: pads face each other, their flats 52 - 2 * 11.95 mm apart, tips 110.475 mm out."""
-    torch = pytest.importorskip("torch")
-    from torch_ekm.kinematics import HandKinematics
-
     hand = load_hand("yale_t42")
     assert hand.planar_normal == (0.0, 0.0, 1.0)
     np.testing.assert_allclose(hand.actuation_jacobian, np.kron(np.eye(2), [[8 / 10.5] * 2]), atol=1e-6)

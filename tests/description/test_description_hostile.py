@@ -1,7 +1,5 @@
 """Files of strangers: whatever their size, depth and figures, an answer within seconds, and a typed one."""
 
-from __future__ import annotations
-
 import re
 import time
 from pathlib import Path

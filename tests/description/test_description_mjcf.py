@@ -1,11 +1,9 @@
 """Hands from MJCF: the tree and the transmission that MuJoCo itself has."""
 
-from __future__ import annotations
-
-import importlib.util
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -16,8 +14,6 @@ from torch_ekm.exceptions import DescriptionError
 from torch_ekm.inspection.check import _to_paste, check_hand
 from torch_ekm.kinematics import HandKinematics
 from torch_ekm.rendering.visuals import visuals
-
-mujoco = pytest.importorskip("mujoco")
 
 # two fingers in our own words: anchors off the body's origin, a reference angle, two joints in one body, a
 # fixed tendon, a joint that follows another, and a tendon under an equality
@@ -285,24 +281,6 @@ def test_a_loose_joint_is_named_with_what_to_do(tmp_path: Path) -> None:
     assert write_template(path).read_text().count('spring = "TODO"') == 3
 
 
-SHADOW = importlib.util.find_spec("gymnasium_robotics")
-
-
-@pytest.mark.skipif(SHADOW is None, reason="gymnasium-robotics is not installed")
-def test_the_shadow_hand_as_others_ship_it() -> None:
-    """Coupled distal joints are fixed tendons that can hardly move."""
-    assert SHADOW is not None
-    assert SHADOW.submodule_search_locations is not None
-    folder = Path(SHADOW.submodule_search_locations[0]) / "envs" / "assets" / "hand"
-    hand = load_hand(folder / "reach.xml")
-    assert (hand.n_q, hand.n_a, len(hand.coupling)) == (24, 20, 4)
-    row = hand.coupling[0]
-    pair = {hand.joint_names[k]: row[k] for k in np.flatnonzero(row)}
-    assert pair == {"robot0:FFJ0": 0.00705, "robot0:FFJ1": -0.00805}
-    q = torch.from_numpy(postures(hand, 1)[0])
-    assert torch.isfinite(HandKinematics(hand)(q).transforms).all()
-
-
 def test_what_check_prints_of_a_pad_lies_there_in_the_mjcf(tmp_path: Path) -> None:
     path, link = written(tmp_path, FINGERS), "first"  # which begins at its joints, not where the body does
     pad = ContactPad("pad", link, (0.001, 0.002, 0.01), (0.001, 0.002, 0.02), 0.007)
@@ -357,9 +335,7 @@ def finger(folder: Path, actuators: str = PULL, limit: str = "", tendons: str = 
     ],
     ids=["limits of a tendon", "offset", "gain alone", "integrates", "damper", "plugin"],
 )  # fmt: skip
-def test_actuators_of_other_kinds(
-    actuators: str, limit: str, ends: tuple[float, float], note: str, tmp_path: Path
-) -> None:
+def test_actuators_of_other_kinds(actuators, limit, ends, note, tmp_path):
     hand = load_hand(finger(tmp_path, actuators, limit))
     (motor,) = hand.actuators
     assert (motor.lower, motor.upper) == pytest.approx(ends)
@@ -374,8 +350,6 @@ def test_a_tendon_without_an_arm_at_rest_is_one(tmp_path: Path) -> None:
     tie = f'<spatial name="tie" range=".0520 .0521">{sites}<site site="c"/></spatial>'
     hand = load_hand(finger(tmp_path, tendons=band + tie))
     model, data = engine(tmp_path / "hand.xml")
-    assert hand.tendon_springs is not None
-    assert hand.loops is not None
     for q in postures(hand):
         data.qpos[:] = q
         mujoco.mj_forward(model, data)

@@ -1,7 +1,5 @@
 """The objects: figures a reader can check, and that bodies are physical."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,10 +1,8 @@
 """Files as their owners have them: rounded inertias, slides, classes with meshes, robots with a hand."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -219,7 +217,6 @@ MESHES = """
 
 
 def read(folder: Path, text: str, name: str = "hand.xml") -> HandDescription:
-    pytest.importorskip("mujoco")
     (folder / name).write_text(text)
     return load_hand(folder / name)
 
@@ -323,11 +320,9 @@ def test_loops_and_springs_of_a_hand_with_held_joints(tmp_path: Path) -> None:
     """What is held stays where MuJoCo starts it, in loops, in couplings and in springs."""
     hand = read(tmp_path, HELD)
     assert hand.joint_names == ("crank", "rod", "finger", "far")
-    assert hand.loops is not None
     assert hand.loops.names == ("four_bar", "four_bar")
     np.testing.assert_array_equal(hand.coupling, [[0, 0, 0, 1]])
     np.testing.assert_allclose(hand.spring_rest, [0, 0, 0, 0.2])
-    assert hand.tendon_springs is not None
     np.testing.assert_allclose(hand.tendon_springs.low, [0.02])
     assert hand.notes == (
         "hands have hinges; joints of other kinds are held: rail, ball",
@@ -350,7 +345,6 @@ def test_the_mass_that_a_file_sets_is_the_hands(tmp_path: Path, monkeypatch: pyt
 
 def test_a_base_link_cuts_a_hand_out_of_an_mjcf(tmp_path: Path) -> None:
     """Poses and gravity in its frame are MuJoCo's, the arm at its zero angles."""
-    mujoco: Any = pytest.importorskip("mujoco")
     (tmp_path / "hand.xml").write_text(CARRIED)
     written = write_template(tmp_path / "hand.xml", "palm")
     text = written.read_text()
@@ -375,7 +369,6 @@ def test_a_base_link_cuts_a_hand_out_of_an_mjcf(tmp_path: Path) -> None:
 
 
 def test_motors_without_range_or_at_all_are_asked_for(tmp_path: Path) -> None:
-    pytest.importorskip("mujoco")
     path = tmp_path / "hand.xml"
     path.write_text(MESHES.replace(' range="0 90"', "").replace(' ctrlrange="0 1.5"', ""))
     with pytest.raises(DescriptionError, match=r"still to be filled in.*actuators\[m\]\.range"):

@@ -1,7 +1,5 @@
 """A transmission file begun from a URDF: it names what lacks, and loads when that is filled in."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from pathlib import Path
@@ -13,7 +11,7 @@ import torch
 from torch_ekm.description import list_hands, load_hand, write_template, write_transmission
 from torch_ekm.description.registry import hand_paths
 from torch_ekm.description.urdf import read_urdf
-from torch_ekm.exceptions import DescriptionError, UnknownNameError
+from torch_ekm.exceptions import DescriptionError
 from torch_ekm.kinematics import ActuationMap
 
 MIMIC = """<robot name="my finger">
@@ -29,12 +27,21 @@ MIMIC = """<robot name="my finger">
 
 
 def filled_in(path: Path) -> str:
-    """The file with figures where it asks for them."""
+    """The file with figures where it asks for them, and its text."""
     text = path.read_text()
     text = text.replace('["TODO", "TODO", "TODO"]', "[0.0, 1.0, 0.0]").replace(
         '["TODO", "TODO"]', "[0.0, 180.0]"
     )
-    return text.replace('"TODO"', "0.5")
+    path.write_text(text.replace('"TODO"', "0.5"))
+    return path.read_text()
+
+
+def mine(folder: Path, text: str = MIMIC) -> tuple[Path, Path, str]:
+    """A URDF, its transmission file, and what stands in it."""
+    urdf = folder / "mine.urdf"
+    urdf.write_text(text)
+    written = write_template(urdf)
+    return urdf, written, filled_in(written)
 
 
 @pytest.mark.parametrize("name", list_hands())
@@ -47,7 +54,7 @@ def test_a_template_names_what_lacks_and_loads_when_it_is_filled_in(name: str, t
     free = joints[-1]
     with pytest.raises(DescriptionError, match=rf"still to be filled in.*joints\.{free}\.spring"):
         load_hand(urdf)
-    written.write_text(filled_in(written))
+    filled_in(written)
     hand, true = load_hand(urdf), load_hand(name)
     assert hand.joint_names == true.joint_names
     assert hand.base_link == true.base_link
@@ -59,11 +66,7 @@ def test_a_template_names_what_lacks_and_loads_when_it_is_filled_in(name: str, t
 
 
 def test_a_mimic_becomes_a_coupling(tmp_path: Path) -> None:
-    urdf = tmp_path / "mine.urdf"
-    urdf.write_text(MIMIC)
-    written = write_template(urdf)
-    good = filled_in(written)
-    written.write_text(good)
+    urdf, written, good = mine(tmp_path)
     hand = load_hand(urdf)
     knuckle, middle = ActuationMap(hand).joints(torch.tensor([[0.1], [0.4]], dtype=torch.float64)).T
     torch.testing.assert_close(middle, 0.5 * knuckle + 0.2, rtol=0, atol=1e-7)
@@ -76,10 +79,7 @@ def test_a_mimic_becomes_a_coupling(tmp_path: Path) -> None:
 
 def test_a_transmission_file_overrules_a_mimic(tmp_path: Path) -> None:
     """By another coupling, by none, or by another angle at rest; each time with a note."""
-    urdf = tmp_path / "mine.urdf"
-    urdf.write_text(MIMIC)
-    written = write_template(urdf)
-    good = filled_in(written)
+    urdf, written, good = mine(tmp_path)
     written.write_text(good.replace("knuckle = -0.5", "knuckle = -0.4"))
     hand = load_hand(urdf)
     assert hand.coupling.tolist() == [[-0.4, 1.0]]
@@ -98,12 +98,8 @@ def test_a_transmission_file_overrules_a_mimic(tmp_path: Path) -> None:
 
 
 def test_a_circle_of_mimics_is_opened(tmp_path: Path) -> None:
-    urdf = tmp_path / "mine.urdf"
     back = '<mimic joint="middle"/><child link="proximal"/>'
-    urdf.write_text(MIMIC.replace('<child link="proximal"/>', back))
-    written = write_template(urdf)
-    written.write_text(filled_in(written))
-    hand = load_hand(urdf)
+    hand = load_hand(mine(tmp_path, MIMIC.replace('<child link="proximal"/>', back))[0])
     assert hand.coupling.tolist() == [[1.0, -1.0]]
     assert "in a circle, is left out: middle (of knuckle)" in hand.notes[0]
 
@@ -117,15 +113,11 @@ def test_a_circle_of_mimics_is_opened(tmp_path: Path) -> None:
     ],
 )
 def test_a_mimic_of_what_does_not_move(mimic: str, locked: bool, note: str, tmp_path: Path) -> None:
-    urdf = tmp_path / "mine.urdf"
     slide = (
         '<link name="x"/><joint name="slide" type="prismatic"><parent link="base"/><child link="x"/></joint>'
     )
     text = MIMIC.replace('joint="knuckle" multiplier="0.5" offset="0.2"', mimic)
-    urdf.write_text(text.replace("</robot>", slide + "</robot>"))
-    written = write_template(urdf)
-    written.write_text(filled_in(written))
-    hand = load_hand(urdf)
+    hand = load_hand(mine(tmp_path, text.replace("</robot>", slide + "</robot>"))[0])
     assert note in " ".join(hand.notes)
     assert "held at 0: slide" in " ".join(hand.notes)
     assert hand.coupling.tolist() == ([[0.0, 1.0]] if locked else [])
@@ -134,19 +126,7 @@ def test_a_mimic_of_what_does_not_move(mimic: str, locked: bool, note: str, tmp_
 
 
 def test_the_pad_of_a_thumb_is_called_so(tmp_path: Path) -> None:
-    urdf = tmp_path / "mine.urdf"
-    urdf.write_text(MIMIC.replace("distal", "thumb_tip"))
-    assert 'name = "thumb_1"' in write_template(urdf).read_text()
-
-
-def test_what_no_template_is_written_for(tmp_path: Path) -> None:
-    with pytest.raises(UnknownNameError, match="urdf"):
-        write_template(tmp_path / "hand.json")
-    with pytest.raises(DescriptionError, match="no such URDF"):
-        write_template(tmp_path / "hand.urdf")
-    (tmp_path / "thing.urdf").write_text('<robot name="thing"><link name="thing"/></robot>')
-    with pytest.raises(DescriptionError, match="no revolute or continuous joint"):
-        write_template(tmp_path / "thing.urdf")
+    assert 'name = "thumb_1"' in mine(tmp_path, MIMIC.replace("distal", "thumb_tip"))[2]
 
 
 @pytest.mark.parametrize("name", ["icub_right", "planar_two_finger"])

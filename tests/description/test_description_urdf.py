@@ -1,14 +1,10 @@
 """What a URDF may hold: elements that are not read, defaults, capsules, meshes, entities."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
-from own_files import change, copied
 
-from torch_ekm.description import load_hand
 from torch_ekm.description.urdf import read_urdf
 from torch_ekm.exceptions import DescriptionError
 
@@ -53,16 +49,6 @@ def test_a_capsule_is_one_shape_and_a_mesh_is_never_opened(tmp_path: Path) -> No
     (capsule,) = link.collisions
     assert (capsule.kind, capsule.size) == ("capsule", (0.01, 0.05))
     np.testing.assert_array_equal(capsule.transform[:3, 3], [0, 0, 0.1])
-
-
-def test_a_hand_of_meshes_loads(tmp_path: Path) -> None:
-    """Its contacts come from pads, which the transmission file gives."""
-    urdf, _ = copied(tmp_path)
-    for shape in ("box", "cylinder", "sphere"):
-        change(urdf, f"<{shape} ", '<mesh filename="a.stl" ', -1)
-    meshes = load_hand(urdf)
-    assert meshes.pads == load_hand("planar_two_finger").pads
-    assert all(link.has_mesh for link in meshes.urdf.links if not link.name.endswith("tip"))
 
 
 BOMB = "".join(f'<!ENTITY e{k} "{10 * f"&e{k - 1};"}">' for k in range(1, 10))

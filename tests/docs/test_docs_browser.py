@@ -1,7 +1,5 @@
 """The built site in a browser, where Chromium is there: nothing is cut, viewers draw and play, no errors."""
 
-from __future__ import annotations
-
 import functools
 import json
 import os

@@ -1,7 +1,5 @@
 """Every block of Python in the documentation runs as printed: page by page, in order, in one namespace."""
 
-from __future__ import annotations
-
 import ast
 import doctest
 import importlib.util
@@ -57,13 +55,10 @@ def serial_port() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("page", [one for one in sources() if blocks(one)], ids=name_of)
-def test_the_examples_of_a_page_run(
-    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch, request):
     code = blocks(page)
     skip_without_its_packages(code)
     if any(PORT in block for block in code):
-        pytest.importorskip("dynamixel_sdk")
         code = [block.replace(PORT, request.getfixturevalue("serial_port")) for block in code]
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "Agg")

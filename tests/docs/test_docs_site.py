@@ -1,7 +1,5 @@
 """The built site: no broken link, nothing from elsewhere, every public name."""
 
-from __future__ import annotations
-
 import functools
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """What every driver does: units, limits, pieces, rest, stale readings, dry run, poses."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import time
@@ -279,7 +277,6 @@ def test_joints_by_markers_and_a_loss(driver) -> None:
 
 
 def test_marker_boards_on_a_camera_give_the_pose() -> None:
-    pytest.importorskip("cv2")
     from torch_ekm.sensing import MarkerBoard, MarkerTracker
     from torch_ekm.simulation import SimulatedCamera
     from torch_ekm.simulation.imaging.card_scene import CardScene, PlacedCard

@@ -1,30 +1,20 @@
 """DynamixelPlant: the genuine SDK against a bus of servos on a pseudo terminal."""
 
-from __future__ import annotations
-
 import math
-import os
 import random
 import re
-import signal
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
 
 import pytest
 import torch
-from wirings import DEG, T42, radians, write
-
-pytest.importorskip("dynamixel_sdk")
-
 from dynamixel_bus import DynamixelBus
 from motors import Motors
-from spoiling import Spoiler
+from wirings import DEG, radians, write
 
 from torch_ekm.drivers import DynamixelPlant
-from torch_ekm.exceptions import BusError, DescriptionError, DeviceError
+from torch_ekm.exceptions import BusError, DescriptionError
 
 TICK = 2 * math.pi / 4096
 
@@ -166,29 +156,6 @@ def test_two_servos_with_one_id(bus, tmp_path) -> None:
         open_at(bus, tmp_path)
 
 
-def test_garbled_messages_send_no_motor_beyond_its_limits(bus, tmp_path) -> None:
-    """Cut, doubled, late and garbled answers: the command is right, or there is a typed error."""
-    draw = random.Random(0)
-    with open_at(bus, tmp_path, still="still_for = 0.05|still_for = 0.01") as plant:
-        bus.spoil, failures, motions = Spoiler(0.1, seed=0), 0, 0
-        for _ in range(25):
-            while bus.motors.moving:
-                time.sleep(0.002)
-            at = [one.value(x) for one, x in zip(plant.wiring.motors, bus.motors.now(), strict=True)]
-            sent = len(bus.goals)
-            try:
-                plant.command(radians(draw.uniform(-0.05, 0.05), draw.uniform(-0.05, 0.05)))
-                motions += 1
-            except DeviceError:
-                failures += 1
-            for goal in bus.goals[sent:]:
-                a = [one.value(x) for one, x in zip(plant.wiring.motors, goal, strict=True)]
-                assert all(abs(x - y) <= 0.05 + 2 * TICK for x, y in zip(a, at, strict=True))
-        assert failures > 0
-        assert motions > 0
-        bus.spoil = lambda packet: packet
-
-
 def test_a_cable_that_is_pulled_is_a_typed_error(bus, tmp_path) -> None:
     plant = open_at(bus, tmp_path)
     bus.close()
@@ -197,38 +164,10 @@ def test_a_cable_that_is_pulled_is_a_typed_error(bus, tmp_path) -> None:
     plant.close()
 
 
-_MOVES = """
-import sys, torch
-from torch_ekm.drivers import DynamixelPlant
-plant = DynamixelPlant(sys.argv[1])
-print("moving", flush=True)
-while True:
-    for sign in (1.0, -1.0):
-        plant.command(sign * torch.tensor([0.3, 0.3], dtype=torch.float64))
-"""
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo terminals")
-def test_the_hand_stands_within_100_ms_after_its_process_is_killed(tmp_path) -> None:
-    with DynamixelBus([1, 2], Motors([1600.0, 2400.0], 300.0)) as bus:
-        path = write(tmp_path, T42, port=bus.port, change="timeout = 0.5|timeout = 5")
-        child = subprocess.Popen([sys.executable, "-c", _MOVES, str(path)], stdout=subprocess.PIPE, text=True)
-        assert child.stdout is not None
-        child.stdout.readline()
-        start = bus.motors.now()
-        while bus.motors.now() == start or not bus.motors.moving:
-            time.sleep(0.005)
-        time.sleep(0.1)
-        os.kill(child.pid, signal.SIGKILL)
-        time.sleep(0.1 + 0.05)  # the watchdog's 80 ms, and what the emulator takes on a busy machine
-        stands = bus.motors.now()
-        time.sleep(0.2)
-        assert bus.motors.now() == stands
-        child.wait()
-        assert bus.tables[1][98] == 255
-        plant = DynamixelPlant(path)  # the next process clears the watchdog
+def test_a_watchdog_that_has_stopped_the_motors_is_cleared_by_the_next_driver(bus, tmp_path) -> None:
+    bus.tables[1][98] = bus.tables[2][98] = 255  # the driver before was killed
+    with open_at(bus, tmp_path) as plant:
         plant.command(radians(0.05, 0.0))
-        plant.close()
 
 
 # -- what servos are -----------------------------------------------------------------------------------------

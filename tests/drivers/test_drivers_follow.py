@@ -1,7 +1,5 @@
 """Movements through waypoints over the buses: to the end, stopped in mid-way, and where the bus dies."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 
@@ -164,7 +162,6 @@ def test_a_pose_on_the_way_is_the_newest_and_is_not_waited_for(driver) -> None:
 
 @pytest.fixture
 def servos(tmp_path):
-    pytest.importorskip("dynamixel_sdk")
     from dynamixel_bus import DynamixelBus
 
     from torch_ekm.drivers import DynamixelPlant

@@ -1,7 +1,5 @@
 """Values by name, whoever sends them, and clocks that are off: without ROS."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Ros2Plant: genuine rclpy on both ends, the hand in a process of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading
@@ -244,9 +242,7 @@ def look(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_messages_that_contradict_each_other_are_named_with_their_node(
-    name, robot, path, monkeypatch
-) -> None:
+def test_messages_that_contradict_each_other_are_named_with_their_node(name, robot, path, monkeypatch):
     monkeypatch.setattr("torch_ekm.drivers.ros2._TIMEOUT", 3.0)
     messages, words = WRONG[name]
     for k, message in enumerate(messages):

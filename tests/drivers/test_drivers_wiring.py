@@ -1,7 +1,5 @@
 """A wiring file is read in the description's order, and every mistake in it is named with its line."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path
@@ -87,7 +85,6 @@ def test_a_motor_that_is_missing_and_a_file_that_is_not_there(tmp_path) -> None:
 
 
 def test_an_mjcf_next_to_the_file_is_its_hand(tmp_path) -> None:
-    pytest.importorskip("mujoco")
     (tmp_path / "hand.xml").write_text("<mujoco><worldbody/></mujoco>")
     with pytest.raises(
         DescriptionError, match=re.escape(str(tmp_path / "hand."))

@@ -1,7 +1,5 @@
 """YarpPlant: the text carrier, against the bytes of a genuine network, and against a genuine one."""
 
-from __future__ import annotations
-
 import random
 import time
 from pathlib import Path

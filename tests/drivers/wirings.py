@@ -1,7 +1,5 @@
 """Wiring files for tests."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

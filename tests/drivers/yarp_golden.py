@@ -1,7 +1,5 @@
 """A YARP network of text alone, as the genuine one was heard: name server, rpc port, a port that sends."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading

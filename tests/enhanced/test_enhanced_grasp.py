@@ -1,7 +1,5 @@
 """An E-KM of a grasped object, and copies of it."""
 
-from __future__ import annotations
-
 import copy
 import math
 import pickle

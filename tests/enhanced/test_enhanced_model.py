@@ -1,7 +1,5 @@
 """f + g for any callable f."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -134,9 +132,7 @@ def test_wrong_kinds_and_widths_are_refused_by_name(generator: torch.Generator, 
 
 
 @pytest.mark.parametrize("spoilt", ["state", "action", "increment"])
-def test_a_learner_that_skips_leaves_bad_samples_out_here_too(
-    generator: torch.Generator, spoilt: str
-) -> None:
+def test_a_learner_that_skips_leaves_bad_samples_out_here_too(generator, spoilt):
     ekm = train(enhanced(), generator, 20)
     ekm.learner.on_invalid = "skip"
     before = {name: value.clone() for name, value in ekm.learner.named_buffers()}

@@ -1,7 +1,5 @@
 """States and files: what they belong to is in them, and a wrong or hostile one changes and runs nothing."""
 
-from __future__ import annotations
-
 import copy
 import json
 import os
@@ -311,7 +309,6 @@ def test_hostile_and_damaged_files(tmp_path: Path) -> None:
 
 
 def test_another_librarys_objects_are_not_saved(tmp_path: Path) -> None:
-    pytest.importorskip("river")
     from torch_ekm.interop import RiverResidual
 
     learner = RiverResidual(3, 2)

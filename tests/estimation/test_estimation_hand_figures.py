@@ -1,7 +1,5 @@
 """The figures of a hand, learned from how objects move."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 import math

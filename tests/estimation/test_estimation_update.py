@@ -1,7 +1,5 @@
 """The update that all estimates share, the recursions that the estimators state, and what they refuse."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Every script in examples/ runs from any folder, and prints what it is there to show."""
 
-from __future__ import annotations
-
 import functools
 import math
 import re
@@ -41,9 +39,7 @@ def test_every_script_is_run() -> None:
 
 @pytest.mark.usefixtures("unchecked")  # a learner's contract gives input that annotations forbid
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_the_script_runs(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_script_runs(name, tmp_path, monkeypatch, capsys):
     needs, arguments, shows = SCRIPTS[name]
     for module in needs:
         pytest.importorskip(module)

@@ -1,8 +1,5 @@
 """Vision and Hall sensors in the loop."""
 
-from __future__ import annotations
-
-import pytest
 import torch
 
 from torch_ekm.experiments.config import Setting
@@ -11,7 +8,6 @@ from torch_ekm.simulation import PRESETS
 
 
 def test_object_is_turned_with_camera_and_hall_sensors() -> None:
-    pytest.importorskip("cv2")
     bench = Bench(Setting(engine="mujoco", sensing=True), "box", "E-KM")
     record = bench.trial(0, 0, 6.0)
     assert record.reason == "reached", record.message
@@ -19,7 +15,6 @@ def test_object_is_turned_with_camera_and_hall_sensors() -> None:
 
 
 def test_a_stuck_hall_channel_keeps_its_first_reading() -> None:
-    pytest.importorskip("cv2")
     bench = Bench(
         Setting(sensing=True, plant=PRESETS["nominal"].replace(stuck_joints=("index_3",))), "box", "KM"
     )

@@ -1,7 +1,5 @@
 """The command line tells everything that it was given to tell."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import warnings
@@ -74,9 +72,7 @@ def test_figures_with_their_intervals_are_not_broken_over_lines() -> None:
 
 
 @pytest.mark.parametrize("width", [60, 100])
-def test_a_table_that_is_too_wide_is_printed_in_parts(
-    width: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_that_is_too_wide_is_printed_in_parts(width, monkeypatch, capsys):
     import torch_ekm._terminal as terminal
 
     monkeypatch.setattr(terminal, "console", Console(markup=False, force_terminal=True, width=width))
@@ -103,9 +99,7 @@ def test_units_of_a_table_are_printed(capsys: pytest.CaptureFixture[str]) -> Non
         assert text in printed
 
 
-def test_the_terminal_has_the_answer_the_first_table_and_the_path(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_the_terminal_has_the_answer_the_first_table_and_the_path(capsys, tmp_path):
     tables = [Table(name, f"Caption {name}", ["case"], [["a" * 20]]) for name in ("one", "two")]
     print_report(Report("Title", "The answer.", tables), tmp_path)
     printed = capsys.readouterr().out
@@ -118,9 +112,7 @@ def test_the_terminal_has_the_answer_the_first_table_and_the_path(
 HOSTILE = "\x1b]0;owned\x07 \x1b[31m[red]x[/] \u202egnp \x9b2J \ud800"
 
 
-def test_text_of_a_file_is_no_command_to_the_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_text_of_a_file_is_no_command_to_the_terminal(capsys, monkeypatch, tmp_path):
     assert as_printed("0.5 ± 0.1 µm\n[deg]") == "0.5 ± 0.1 µm\n[deg]"
     print_report(Report("", HOSTILE, [Table("t", HOSTILE, [HOSTILE], [[HOSTILE]], HOSTILE)]), tmp_path, True)
     (tmp_path / "hand.urdf").write_text(f'<robot><link name="{HOSTILE[1:8]}&#x9b;2J[/]\\"/></robot>')

@@ -1,7 +1,5 @@
 """A wrong option of any command is told in one line, and ends with 1 or 2; nothing is written."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 
@@ -102,9 +100,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_option_is_told_in_one_line(
-    case: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_option_is_told_in_one_line(case, place, monkeypatch, capsys):
     command, _, told = case.partition(" | ")
     monkeypatch.chdir(place)
     monkeypatch.delenv("TORCH_EKM_DATA", raising=False)
@@ -120,9 +116,7 @@ def test_a_wrong_option_is_told_in_one_line(
     assert sorted(place.iterdir()) == before
 
 
-def test_the_job_in_which_it_went_wrong_is_told(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_job_in_which_it_went_wrong_is_told(monkeypatch, capsys):
     def fails(**options: object) -> None:
         error = ParameterError("dead_zone", -1.0, "positive")
         error.add_note("in the job 'box_1000'")

@@ -1,7 +1,5 @@
 """Comparing learners: the protocol is honest, the statistics are right, and broken files are told clearly."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -1,7 +1,5 @@
 """The main job, small: the loop closes, learns, reports, resumes, and fails clearly."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path
@@ -57,14 +55,6 @@ def test_enhanced_model_predicts_better_than_the_kinematic_model(report: Report)
     assert row["E-KM, one motion [deg]"].mean < 0.8 * row["KM, one motion [deg]"].mean
 
 
-def test_untrained_first_step_is_the_kinematic_models(records: list[TrialRecord]) -> None:
-    first = next(r for r in records if r.controller == "E-KM" and r.angle_deg == 9.0)
-    assert first.prediction_ekm_deg[0] == pytest.approx(
-        first.prediction_km_deg[0], abs=0.05
-    )  # pieces compose
-    assert first.prediction_ekm_deg[1] != pytest.approx(first.prediction_km_deg[1], rel=1e-3)
-
-
 def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Path) -> None:
     page = (folder / "index.html").read_text()
     for name in (
@@ -83,16 +73,6 @@ def test_report_is_complete_and_says_how_it_was_made(report: Report, folder: Pat
     assert configuration["experiment"]["objects"] == ["box"]
     by_angle = next(table for table in report.tables if table.name == "by_angle")
     assert [row[0] for row in by_angle.rows] == ["9", "14", "all"]
-
-
-def test_a_finished_demo_is_not_run_again(
-    records: list[TrialRecord], folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Demo, "report", lambda *arguments: Report("resumed", ""))
-    monkeypatch.setattr(Report, "write", lambda *arguments: folder)
-    before = {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*.json")}
-    reproduce(EXPERIMENT, folder)
-    assert {path: path.stat().st_mtime_ns for path in (folder / "runs").glob("*.json")} == before
 
 
 def test_the_first_hand_turns_objects_that_it_has_never_held() -> None:

@@ -1,11 +1,7 @@
 """Names of learners, and the page that tells what each is made with."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
-
-import pytest
 
 from torch_ekm import residual
 from torch_ekm._recorded import describe, differences
@@ -14,7 +10,6 @@ from torch_ekm.experiments.learners import COMPARED, LEARNERS
 PAGE = Path(__file__).parents[2] / "docs" / "how_to" / "choose_a_learner.md"
 
 
-@pytest.mark.skipif(not PAGE.is_file(), reason="the documentation is not part of this installation")
 def test_the_page_has_the_call_of_each_name() -> None:
     section = PAGE.read_text(encoding="utf-8").split("## Names in")[1].split("\n## ")[0]
     rows = [row.strip("| ").split(" | ") for row in section.splitlines() if "`" in row and row[0] == "|"]

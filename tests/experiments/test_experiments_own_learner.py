@@ -1,7 +1,5 @@
 """Learners of the user's own in a comparison: lambdas and local classes, in processes, resumed, refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

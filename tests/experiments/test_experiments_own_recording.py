@@ -1,7 +1,5 @@
 """A recording of one's own: columns become motions, and motions what the model left over."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

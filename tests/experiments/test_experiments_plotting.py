@@ -1,14 +1,9 @@
 """Figures show what the tables say."""
 
-from __future__ import annotations
-
 import numpy as np
-import pytest
-from experiments_records import frame, turn
+from made_up_sessions import frame, turn
 
 from torch_ekm.experiments.reporting.plots import plot_steady_state_error
-
-pytest.importorskip("matplotlib")
 
 
 def test_a_lost_object_does_not_hide_the_others() -> None:

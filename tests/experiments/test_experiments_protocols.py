@@ -1,14 +1,12 @@
 """The paper's experiments, small: paired grasps, events, settings, learners by name."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 from pathlib import Path
 
 import pytest
 import torch
-from experiments_records import frame, not_grasped
+from made_up_sessions import frame, not_grasped
 
 from torch_ekm.control import DEFAULT_TASKS, EffortTask, OneStep, Safety, StepBound, StoppingRule
 from torch_ekm.description.registry import object_paths

@@ -1,7 +1,5 @@
 """reproduce: plans, reports, resume after a kill, and the command line."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import html
@@ -11,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiments_records import turn
-from made_up_sessions import made_up_generalize, made_up_online
+from made_up_sessions import made_up_generalize, made_up_online, turn
 from typer.testing import CliRunner
 
 from torch_ekm.cli import app
@@ -74,9 +71,7 @@ def test_report_is_complete(name: str, reports: Callable[[str], tuple[Report, Pa
     assert "not tested" in report.summary
 
 
-def test_a_hand_that_cannot_be_modelled_gives_the_reason_alone_and_ends_with_1(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_hand_that_cannot_be_modelled_gives_the_reason_alone_and_ends_with_1(tmp_path, monkeypatch):
     ended = {"reason": "unstable grasp", "message": "two hard fingers", "seconds": (), "errors_deg": (9.0,)}
     monkeypatch.setattr(Demo, "session", lambda _, item, name, seed: [turn(name, seed, 9.0, **ended)])
     out = tmp_path / "demo"
@@ -99,9 +94,7 @@ def test_a_quick_report_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.usefixtures("made_up")
-def test_killed_run_resumes_to_the_same_report(
-    tmp_path: Path, reports: Callable[[str], tuple[Report, Path]]
-) -> None:
+def test_killed_run_resumes_to_the_same_report(tmp_path, reports):
     (_, whole), broken = reports("generalize"), tmp_path / "broken"
     experiment = plan("generalize", (0, 1, 2))
     done: list[str] = []
@@ -141,10 +134,3 @@ def test_plans_are_checked() -> None:
         plan("online", ())
     for name in PROTOCOLS:
         assert len(plan(name, quick=True).jobs) < len(plan(name).jobs)
-
-
-def test_angles_of_a_user() -> None:
-    planned = plan("generalize", (0,), angles_deg=(4.0, 8.0))
-    assert isinstance(planned.protocol, Generalize)
-    assert planned.protocol.angles_of("box") == (4.0, 8.0)
-    assert planned.jobs.keys() != plan("generalize", (0,)).jobs.keys()  # no old results are taken up

@@ -1,7 +1,5 @@
 """From records to claims: losses stay visible, pairs stay pairs, intervals cover; closed forms."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import re
@@ -10,7 +8,7 @@ import numpy as np
 import pandas
 import pytest
 import scipy.stats
-from experiments_records import frame, not_grasped, turn
+from made_up_sessions import frame, not_grasped, turn
 
 from torch_ekm.exceptions import StateError
 from torch_ekm.experiments.protocols.generalize import significance_table
@@ -28,13 +26,7 @@ from torch_ekm.experiments.reporting.statistics import (
     select,
     unit_means,
 )
-from torch_ekm.experiments.reporting.tables import (
-    controller_table,
-    error_table,
-    ratio,
-    reason_table,
-    verdict,
-)
+from torch_ekm.experiments.reporting.tables import controller_table, error_table, ratio, reason_table, verdict
 
 # -- records -----------------------------------------------------------------------------------------
 
@@ -110,9 +102,8 @@ def test_means_over_the_motions_are_of_the_right_list() -> None:
 
 
 def test_bootstrap_is_scipys() -> None:
-    scipy_stats = pytest.importorskip("scipy.stats")
     values = np.random.default_rng(4).exponential(1.0, 20)
-    theirs = scipy_stats.bootstrap(
+    theirs = scipy.stats.bootstrap(
         (values,), np.mean, n_resamples=4000, method="percentile", rng=np.random.default_rng(0)
     )
     ours = bootstrap_mean(values)

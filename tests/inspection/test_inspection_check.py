@@ -1,7 +1,5 @@
 """A hand that is fit passes; each fault ends in a row that names the part."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -22,8 +20,6 @@ from torch_ekm.inspection.check import check_hand
 from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import SimulatedHand
 from torch_ekm.simulation.grasp_planning import pinch
-
-pytest.importorskip("sapien")
 
 HAND = load_hand("planar_two_finger")
 #: A turn of 3 deg is enough for its row to be ok; to its very end one test below follows it.

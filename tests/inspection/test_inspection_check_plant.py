@@ -1,7 +1,5 @@
 """Twelve wrong wirings, each found before anything but motions of a few degrees, and named with its line."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
@@ -252,7 +250,6 @@ def test_a_driver_of_ones_own_that_commands_the_wrong_way_or_in_degrees(tmp_path
 @pytest.fixture
 def inner():
     """A simulated hand that holds a can."""
-    pytest.importorskip("sapien")
     from torch_ekm.simulation import SimulatedHand
 
     inner = SimulatedHand("planar_two_finger", "can", preset="none")
@@ -286,7 +283,6 @@ def test_signs_of_a_held_object_by_its_pose(inner) -> None:
 
 
 def test_the_command_checks_a_hand_on_a_bus(tmp_path) -> None:
-    pytest.importorskip("dynamixel_sdk")
     from dynamixel_bus import DynamixelBus
     from motors import Motors
     from typer.testing import CliRunner

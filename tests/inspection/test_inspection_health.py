@@ -1,7 +1,5 @@
 """Which actuator changed, from motions that are made up; benchmarks/hand_health.py has simulated ones."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re
@@ -10,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from torch_ekm.cli import app
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import StateError
 from torch_ekm.inspection.health import hand_health
@@ -81,7 +81,6 @@ def test_a_tendon_that_breaks_is_named_at_once(seed: int) -> None:
     (change,) = hand_health(HAND, [(7, made.log)])
     assert change[:4] == (("left", "right")[motor], "tendon", 7, 30)
     went = re.match(r"its joints went (-\d+\.\d) deg by themselves", change.found)
-    assert went is not None
     assert float(went[1]) == pytest.approx(-30, abs=5)
     assert change.found.endswith("broken, slipped, or off its pulley")
 
@@ -161,10 +160,6 @@ def test_a_log_of_another_hand_is_refused() -> None:
 
 
 def test_the_command_reads_logs(tmp_path: Path, monkeypatch) -> None:
-    pytest.importorskip("h5py", reason="extra 'sim'")
-    CliRunner = pytest.importorskip("typer.testing", reason="extra 'plots'").CliRunner
-    from torch_ekm.cli import app
-
     def health(*names: str) -> tuple[int, str]:
         done = CliRunner().invoke(app, ["health", *names])
         return done.exit_code, done.output.partition("Next:")[0] or str(done.exception)

@@ -1,7 +1,5 @@
 """From a bus to a wiring file that a check passes, and without one; zeros of tendons; figures of servos."""
 
-from __future__ import annotations
-
 import math
 import random
 import re
@@ -157,7 +155,6 @@ def scanned():
         yield bus
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo terminals")
 def test_a_scanned_bus_becomes_a_wiring_that_moves_the_hand(scanned, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("torch_ekm.drivers.dynamixel_port._PATIENCE_MS", 2000.0)  # the machine may be busy
     path = tmp_path / "my_hand.toml"

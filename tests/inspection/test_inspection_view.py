@@ -1,7 +1,5 @@
 """A hand, a grasp and a log can be looked at; what is none of them is named."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace
@@ -18,8 +16,6 @@ from torch_ekm.inspection.view import view, view_hand, view_log
 from torch_ekm.plant import RecordingPlant, Trajectory, TrialLog
 from torch_ekm.rendering import Captions, save_animation
 from torch_ekm.simulation import SimulatedHand
-
-pytest.importorskip("sapien")
 
 
 @pytest.fixture(scope="module")

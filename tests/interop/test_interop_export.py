@@ -1,7 +1,5 @@
 """What is exported says what torch says, to 1e-12."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -132,7 +130,6 @@ def test_a_mixture_names_a_learner_without_jacobians() -> None:
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_casadi_says_the_same_while_it_learns(name: str) -> None:
-    pytest.importorskip("casadi", reason="extra 'interop'")
     learner = trained(name)
     g = to_casadi(learner)
     function = g.function
@@ -156,7 +153,6 @@ class Flat(SquaredExponential):
 
 
 def test_casadi_names_what_it_cannot_say() -> None:
-    pytest.importorskip("casadi", reason="extra 'interop'")
     kernel = DeepKernel(Flat(1), hidden=(2,), features=1)
     with pytest.raises(ParameterError, match=r"Flat.*no subclass"):
         to_casadi(SparseOnlineGP(1, 1, kernel=kernel))

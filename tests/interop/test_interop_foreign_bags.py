@@ -1,22 +1,18 @@
 """Recordings as ros2_control, Gazebo, a LEAP hand and an arm beside a hand leave them: with holes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rosbags import rosbag1, rosbag2, typesys
+from rosbags.convert.converter import LATCH
 
 from torch_ekm.exceptions import DescriptionError
 from torch_ekm.experiments import Columns, load_own
 from torch_ekm.experiments.learner_comparison.stream import load_table
 from torch_ekm.interop import read_bag
-
-typesys = pytest.importorskip("rosbags.typesys", reason="extra 'interop'")
-from rosbags import rosbag1, rosbag2  # noqa: E402
-from rosbags.convert.converter import LATCH  # noqa: E402
 
 TYPES = {
     kind: typesys.get_typestore(getattr(typesys.Stores, "ROS1_NOETIC" if kind == "ros1" else "LATEST"))

@@ -1,14 +1,15 @@
 """Trials leave as MCAP, as .rrd and as a LeRobot dataset, and are read back; recordings without ROS."""
 
-from __future__ import annotations
-
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from made_up import trajectory
+from pyarrow import parquet
+from rosbags.highlevel import AnyReader
 
 from torch_ekm.exceptions import DescriptionError, OutputError, ParameterError, UnknownNameError
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
@@ -16,9 +17,6 @@ from torch_ekm.interop import log_to_lerobot, log_to_mcap, read_bag
 from torch_ekm.interop.bags import _numbers
 from torch_ekm.kinematics import poses
 from torch_ekm.plant import Observation, Trajectory, TrialLog
-
-AnyReader = pytest.importorskip("rosbags.highlevel", reason="extra 'interop'").AnyReader
-pytest.importorskip("h5py", reason="extra 'sim'")
 
 
 def test_a_log_has_a_recording_for_each_trial(tmp_path: Path) -> None:
@@ -129,7 +127,6 @@ def same(row, seen: Observation, command: torch.Tensor) -> None:
 
 
 def test_a_dataset_has_a_frame_for_each_observation(log: TrialLog, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="extra 'interop'")
     folder = log_to_lerobot(log, tmp_path / "dataset", "turn it")
     rows = parquet.read_table(folder / "data/chunk-000/file-000.parquet").to_pylist()
     for row, (seen, command) in zip(rows, frames(log), strict=True):
@@ -145,8 +142,6 @@ def test_a_dataset_has_a_frame_for_each_observation(log: TrialLog, tmp_path: Pat
 
 
 def test_a_dataset_on_a_full_disk_is_a_typed_error_and_leaves_nothing(log: TrialLog, tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow", reason="extra 'interop'")
-    resource = pytest.importorskip("resource", reason="not on Windows")
     most = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, most[1]))
     try:
@@ -159,7 +154,6 @@ def test_a_dataset_on_a_full_disk_is_a_typed_error_and_leaves_nothing(log: Trial
 
 
 def test_a_dataset_is_of_one_hand(log: TrialLog, tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow", reason="extra 'interop'")
     log.write(5, trajectory(5, 2, n_a=3), {})
     with pytest.raises(ParameterError, match="all with the same joints"):
         log_to_lerobot(log, tmp_path / "dataset")

@@ -1,19 +1,17 @@
 """Learners keep river's contract; the benchmark on public records measures what the protocols say."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np
+import public_streams
 import pytest
 import torch
+from river import checks, datasets, dummy, evaluate, metrics, stats
 
 from torch_ekm import LearnHyperparameters, SparseOnlineGP, Standardize, ZeroResidual
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, StateError
 from torch_ekm.interop import OnlineRegressor, as_river
 from torch_ekm.interop.online_regressor import make_learner
-
-river = pytest.importorskip("river", reason="extra 'interop'")
 
 
 def small(d: int, m: int) -> SparseOnlineGP:
@@ -33,15 +31,11 @@ def wave(n: int, seed: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_river_finds_nothing_wrong() -> None:
-    from river import checks
-
     checks.check_estimator(as_river(tiny(6, 1)))
 
 
 def test_river_finds_nothing_wrong_with_features_that_come_and_go() -> None:
     """With a factory, which is asked for as many inputs as the first sample has features."""
-    from river import checks
-
     model = as_river(tiny)
     chosen = [one for one in checks.yield_checks(model) if re.search("features|clone", one.__name__)]
     assert len(chosen) > 2
@@ -50,8 +44,6 @@ def test_river_finds_nothing_wrong_with_features_that_come_and_go() -> None:
 
 
 def test_river_example() -> None:
-    from river import datasets, dummy, evaluate, metrics, stats
-
     model = as_river(SparseOnlineGP(6, 1, parts=[Standardize(), LearnHyperparameters()]))
     error = evaluate.progressive_val_score(datasets.TrumpApproval().take(300), model, metrics.RMSE())
     mean = evaluate.progressive_val_score(
@@ -116,11 +108,6 @@ def test_a_first_target_that_is_skipped_is_not_the_offset() -> None:
     assert regressor.predict(np.zeros((1, 1)))[0][0, 0] == pytest.approx(5.0)
 
 
-public_streams = pytest.importorskip(
-    "public_streams", reason="the benchmarks are not part of this installation"
-)
-
-
 def test_progressive_error_from_nothing_and_intervals_over_the_range() -> None:
     random = np.random.default_rng(0)
     x, y = random.random((1200, 2)), 10.0 + random.normal(size=1200)
@@ -137,8 +124,6 @@ def test_progressive_error_from_nothing_and_intervals_over_the_range() -> None:
 
 
 def test_rivers_track_is_scored_by_river() -> None:
-    from river import datasets, dummy, stats
-
     row = public_streams.track("TrumpApproval", "mean", dummy.StatisticRegressor(stats.Mean()), 50)
     y = np.array([target for _, target in datasets.TrumpApproval().take(50)])
     before = np.concatenate([[0.0], np.cumsum(y)[:-1] / np.arange(1, 50)])

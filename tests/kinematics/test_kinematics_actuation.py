@@ -3,8 +3,6 @@
 What the motors of iCub hands move: robotology/gazebo-yarp-plugins @f837061b, ControlBoardDriverCoupling.cpp.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -7,8 +7,6 @@ icub-tech-iit/documentation (icub-forward-kinematics-fingers.md). iKin counts th
 spread pose, has a dummy second link in the thumb and no abduction in the middle finger.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import pickle
@@ -62,18 +60,6 @@ def test_poses_to_the_last_digits(name: str) -> None:
     kinematics = HandKinematics(hand)
     for k in range(5):  # a single posture goes another way
         torch.testing.assert_close(kinematics(q[0, k]).transforms, expected[0, k], atol=1e-12, rtol=0)
-
-
-@pytest.mark.parametrize("name", HANDS)
-def test_agrees_with_another_reader_of_the_file(name: str) -> None:
-    """pytorch-kinematics parses the URDF itself, with origins in float32."""
-    pk = pytest.importorskip("pytorch_kinematics")
-    hand, q = load_hand(name), postures(name, 10)
-    chain = pk.build_chain_from_urdf(hand.urdf_path.read_bytes()).to(dtype=torch.float64)
-    assert tuple(chain.get_joint_parameter_names()) == hand.joint_names
-    frames, poses = chain.forward_kinematics(q), HandKinematics(hand)(q)
-    for link in hand.link_names:
-        torch.testing.assert_close(poses.of(link), frames[link].get_matrix(), atol=3e-7, rtol=0)
 
 
 @pytest.mark.parametrize("name", HANDS)

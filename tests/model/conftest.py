@@ -1,7 +1,5 @@
 """What tests of the model share."""
 
-from __future__ import annotations
-
 import pytest
 from model_toys import Toy, three_finger
 

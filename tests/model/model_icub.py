@@ -1,7 +1,5 @@
 """The iCub hand holding a box or a can between thumb, index and middle finger."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import lru_cache
 

@@ -1,7 +1,5 @@
 """Small hands for the tests: joints in chains, ball fingertips, kinematics of their own."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Motions whose contacts stick, slide, open and close: derivatives in each mode, and the simulated hand."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,7 +1,5 @@
 """The grasp worked by hand in the docs: the model gives every number printed there."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

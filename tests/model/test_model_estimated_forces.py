@@ -1,7 +1,5 @@
 """Contact forces from what fingertips, motors and the step before say."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import torch

@@ -1,7 +1,5 @@
 """Whatever comes in: a typed answer, never NaN, and the same one whatever the axes."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The derivative of J_m by figures of the hand, in closed form; J_m as a function of the state has none."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

@@ -1,7 +1,5 @@
 """The iCub hand itself in a three-finger pinch of a box: noise, joints at their stops; batches."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,7 +1,5 @@
 """Every wrong input has a typed error that names it; what can be read rightly is."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

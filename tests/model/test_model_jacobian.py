@@ -1,7 +1,5 @@
 """J_m against finite differences of exact equilibria, and these against the least energy."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math
@@ -20,6 +18,7 @@ from model_toys import (
     soft_two_finger,
     three_finger,
 )
+from scipy.optimize import minimize
 
 from torch_ekm.contact.contacts import contact_frames
 from torch_ekm.kinematics.poses import exp
@@ -114,7 +113,6 @@ def test_forces_and_jacobian_from_the_state_alone(name):
 
 def test_pinned_equilibria_minimise_the_energy():
     # independent: SLSQP on the potential, contact points glued together, no Jacobian of ours
-    scipy_optimize = pytest.importorskip("scipy.optimize")
     toy = planar_two_finger(pinned=True)
     solver, start = toy.solver(), toy.equilibrium()
     a = start.a + torch.tensor([0.4e-3, -0.2e-3], dtype=F64) / toy.unit
@@ -144,7 +142,7 @@ def test_pinned_equilibria_minimise_the_energy():
         return torch.cat([closing, tendons]).numpy()
 
     x0 = np.concatenate([toy.state.q.numpy(), np.zeros(3)])
-    best = scipy_optimize.minimize(
+    best = minimize(
         energy, x0, method="SLSQP", constraints={"type": "eq", "fun": constraints}, options={"ftol": 1e-15}
     )
     q, o, R = unpack(best.x)

@@ -1,7 +1,5 @@
 """A grasp whose moment arms change, with tendon springs and loops: against differences of equilibria."""
 
-from __future__ import annotations
-
 import copy
 import dataclasses
 
@@ -71,7 +69,6 @@ def test_figures_that_are_learned_are_factors_of_the_arms(motion: ContactMotion)
     """J_m by each entry of J_a, the arms being functions of the posture."""
     model = motion.model
     lin = model.linearize(motion.state, model.contacts(motion.state))
-    assert lin.equations is not None
     drives, still = model.reduction.drives, torch.zeros(model.hand.n_q, dtype=torch.float64)
     way, rows = torch.linspace(0.01, 0.02, model.hand.n_a, dtype=torch.float64), list(range(lin.n_q + 6))
     now = lin.equations.solve(still, drives)

@@ -1,7 +1,5 @@
 """The model says what speaks against it: every kind of doubt, its figures and its order."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -9,8 +7,6 @@ import pytest
 import torch
 from model_icub import gripped
 from model_toys import F64, batch_of, changed, soft_two_finger, stacked, three_finger
-
-pytest.importorskip("coal")
 
 from torch_ekm.contact.contacts import NearMiss
 from torch_ekm.description import Shape, load_hand, load_object

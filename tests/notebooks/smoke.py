@@ -5,8 +5,6 @@
 Cells have the sizes that teach; here stands what is put in their place.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The notebooks as files: complete, without stray outputs, and there for those without a checkout."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

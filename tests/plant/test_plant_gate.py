@@ -1,7 +1,5 @@
 """What passes the gate before a plant, and what does not."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import threading

@@ -1,7 +1,5 @@
 """Movements through waypoints: what passes the gate, the inverse of the servos, wrappers, recordings."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,7 +1,5 @@
 """The servo inverse against servos whose dead zone and bias are known."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -41,12 +39,18 @@ def moves(n: int, seed: int = 1, size: float = 2.0) -> list[torch.Tensor]:
     return list(size * DEG * torch.randn(n, 3, generator=generator, dtype=torch.float64))
 
 
-def test_dead_zone_and_bias_are_found_within_their_standard_errors() -> None:
-    inner = Servos()
+def practised(n: int, inner: Servos | None = None) -> tuple[ServoInverse, Servos]:
+    """After so many motions."""
+    inner = Servos() if inner is None else inner
     plant = ServoInverse(inner, HAND)
     plant.reset(0)
-    for w in moves(40):
+    for w in moves(n):
         plant.command(w)
+    return plant, inner
+
+
+def test_dead_zone_and_bias_are_found_within_their_standard_errors() -> None:
+    plant, inner = practised(40)
     error = torch.stack([plant.servo.dead_zone, plant.servo.bias]) - torch.from_numpy(
         np.stack([inner.d, inner.b])
     )
@@ -82,11 +86,7 @@ def test_a_small_error_is_no_rest_point_and_nothing_winds_up_on_reversal() -> No
 
 
 def test_a_servo_that_never_moves_is_named_and_not_wound_up() -> None:
-    inner = Servos()
-    plant = ServoInverse(inner, HAND)
-    plant.reset(0)
-    for w in moves(30):
-        plant.command(w)
+    plant, inner = practised(30)
     known = plant.servo.estimate.clone()
     inner.blocked[1] = True
     for k in range(15):
@@ -101,10 +101,7 @@ def test_a_servo_that_never_moves_is_named_and_not_wound_up() -> None:
 
 
 def test_the_end_of_the_range_teaches_nothing() -> None:
-    plant = ServoInverse(Servos(), HAND)
-    plant.reset(0)
-    for w in moves(30):
-        plant.command(w)
+    plant, _ = practised(30)
     known = plant.servo.estimate.clone()
     for _ in range(8):
         plant.command(torch.full((3,), 15 * DEG, dtype=torch.float64))
@@ -147,11 +144,7 @@ def test_set_points_stay_in_the_range() -> None:
             return super().command(delta_a)
 
     goals: list[np.ndarray] = []
-    inner = Watched()
-    plant = ServoInverse(inner, HAND)
-    plant.reset(0)
-    for w in moves(10):
-        plant.command(w)
+    plant, inner = practised(10, Watched())
     inner.a[:] = REACH * [1, -1, 1] - [0.5 * DEG, -0.5 * DEG, -0.1 * DEG]  # the last one is read beyond it
     plant.reset(0)
     goals.clear()
@@ -161,11 +154,7 @@ def test_set_points_stay_in_the_range() -> None:
 
 @pytest.mark.parametrize("scale", [0.2, 2.5])
 def test_a_repaired_servo_is_found_again(scale: float) -> None:
-    inner = Servos()
-    plant = ServoInverse(inner, HAND)
-    plant.reset(0)
-    for w in moves(60):
-        plant.command(w)
+    plant, inner = practised(60)
     inner.d = scale * inner.d
     for w in moves(12, seed=3):
         plant.command(w)
@@ -187,10 +176,7 @@ def test_readings_that_no_dead_zone_explains_are_undone_by_what_was_learned_of_t
 
 @pytest.mark.usefixtures("unchecked")
 def test_bad_input_changes_nothing_and_a_state_dict_carries_all() -> None:
-    plant = ServoInverse(Servos(), HAND)
-    plant.reset(0)
-    for w in moves(5):
-        plant.command(w)
+    plant, _ = practised(5)
     kept = {k: v.clone() for k, v in plant.servo.state_dict().items()}
     with pytest.raises(ShapeError):
         plant.servo.update(torch.zeros(2), torch.zeros(3))

@@ -1,7 +1,5 @@
 """The truth of a simulation is for simulated sensors and for reports; nothing else reads it."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is put around a plant passes on all that it does not change; the mean of several readings at rest."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 
@@ -251,7 +249,6 @@ def test_the_mean_of_frames_is_no_newer_than_any_of_them() -> None:
 
 
 def test_a_recording_keeps_stamps_and_does_without(tmp_path) -> None:
-    pytest.importorskip("h5py")
     dated = Trajectory(1, [Q], [reading(1.0, 1.0), reading(2.0, 1.0)])
     kept = Trajectory.load(dated.save(tmp_path / "dated.h5"))
     assert [o.stamps for o in kept.observations] == [o.stamps for o in dated.observations]

@@ -1,12 +1,11 @@
 """Where things are drawn, what they look like, and from where they are looked at; no graphics needed."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from torch_ekm.description import list_hands, load_hand, load_object, write_template
 from torch_ekm.description.urdf import read_urdf
@@ -84,12 +83,10 @@ def test_a_planar_hand_is_seen_from_the_front_whatever_pulls(gravity):
 
 
 def test_a_picture_that_cannot_be_drawn_is_an_error(tmp_path):
-    pytest.importorskip("pyvista")
     with pytest.raises(EKMError, match="could not draw"):
         save_picture(scene_of("icub_right", PALM_DOWN), tmp_path / "nowhere" / "picture.png")
 
 
-trimesh = pytest.importorskip("trimesh")
 LOOKS = """<visual><origin xyz="0.1 0 0" rpy="0 0 1.5707963"/>
   <geometry><mesh filename="NAME" scale="0.001 0.001 0.002"/></geometry></visual>"""
 
@@ -130,9 +127,7 @@ def test_a_mesh_is_drawn_where_the_urdf_puts_it(suffix: str, tmp_path: Path) -> 
         ("", None, ""),
     ],
 )
-def test_a_mesh_that_cannot_be_read_is_told_and_what_touches_is_drawn(
-    name: str, content: str | None, told: str, tmp_path: Path
-) -> None:
+def test_a_mesh_that_cannot_be_read_is_told_and_what_touches_is_drawn(name, content, told, tmp_path):
     if content is not None:
         (tmp_path / name).write_text(content)
     found = visuals(read_urdf(finger(tmp_path, LOOKS.replace("NAME", name))))

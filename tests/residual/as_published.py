@@ -1,7 +1,5 @@
 """The sparse GP as published: inputs and outputs as they are, no part but those that a test names."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """Kernel, noise and features learned online: the loss, its gradients, the memory, and what it all gains."""
 
-from __future__ import annotations
-
 import copy
 import math
 
@@ -37,7 +35,6 @@ def system(seed: int, n: int, noise: float = 0.1) -> tuple[torch.Tensor, torch.T
 
 def learning_of(gp: SparseOnlineGP) -> LearnHyperparameters:
     part = gp.part(LearnHyperparameters)
-    assert part is not None
     return part
 
 

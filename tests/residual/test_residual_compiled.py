@@ -1,7 +1,5 @@
 """Compiled loops do what torch does, share its memory, and step back where torch must work."""
 
-from __future__ import annotations
-
 import copy
 import importlib
 import subprocess
@@ -30,7 +28,6 @@ from torch_ekm.residual import (
 from torch_ekm.residual.sparse_gp.engine import loading
 
 D, M = 4, 2
-numba_here = pytest.mark.skipif(not warm_up(), reason="needs the extra 'fast'")
 
 
 def hard_stream(n: int, *fleet: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -100,7 +97,6 @@ def assert_alike(
     torch.testing.assert_close(b(x), a(x), atol=tolerance, rtol=tolerance)
 
 
-@numba_here
 @pytest.mark.parametrize("shape", [(), (3,)])
 @pytest.mark.parametrize("name", OPTIONS)
 def test_compiled_loops_do_what_torch_does(name, shape):
@@ -129,7 +125,6 @@ KERNELS = {
 }
 
 
-@numba_here
 @pytest.mark.parametrize(("shape", "memory"), [((), 60), ((3,), 0), ((3,), 60)])
 @pytest.mark.parametrize("name", KERNELS)
 def test_compiled_steps_and_rebuilds_are_those_of_torch(name, shape, memory):
@@ -151,7 +146,6 @@ def test_compiled_steps_and_rebuilds_are_those_of_torch(name, shape, memory):
     assert torch.equal(fast(x[0]), copied(x[0]))
 
 
-@numba_here
 @pytest.mark.parametrize("shape", [(), (3,)])
 def test_compiled_units_are_those_of_torch(shape):
     generator = torch.Generator().manual_seed(0)
@@ -164,7 +158,6 @@ def test_compiled_units_are_those_of_torch(shape):
         first = 32 * k + 5  # of a ring, whose end lies within the block
         for i in range(32):
             gp.recent.keep(first + i, x[..., i, :], x[..., i, :M], on[..., i])
-        assert gp.engine is not None
         assert gp.engine.pool(gp, first + 32, 32)
         other.units.pool(x, x[..., :M], on)
         changes = gp.engine.settle(gp), (other.units.input.settle(), other.units.output.settle())
@@ -198,7 +191,6 @@ def used(gp: SparseOnlineGP, call, monkeypatch) -> bool:
     return bool(done)
 
 
-@numba_here
 def test_where_torch_must_do_the_work(monkeypatch):
     x, y = hard_stream(30)
     gp = pair("plain")[1]
@@ -230,7 +222,6 @@ def test_where_torch_must_do_the_work(monkeypatch):
             assert not used(learner, lambda learner=learner: learner.update(x[0], y[0]), monkeypatch)
 
 
-@numba_here
 def test_rows_that_are_not_contiguous_are_learned_as_they_are(monkeypatch):
     x, y = hard_stream(30)
     gp, other = pair("all")[1], pair("all")[1]
@@ -243,7 +234,6 @@ def test_rows_that_are_not_contiguous_are_learned_as_they_are(monkeypatch):
         assert torch.equal(gp(x[t]), other(apart[t]))
 
 
-@numba_here
 @pytest.mark.parametrize("name", ["plain", "deep"])
 def test_an_answer_follows_samples_and_parameters(name):
     x, y = hard_stream(60)
@@ -260,7 +250,6 @@ def test_an_answer_follows_samples_and_parameters(name):
     torch.testing.assert_close(gp(query), gp(query.unsqueeze(0))[0])
 
 
-@numba_here
 def test_an_answer_that_was_given_away_may_be_changed():
     gp = pair("plain")[1]
     x, y = hard_stream(20)
@@ -272,7 +261,6 @@ def test_an_answer_that_was_given_away_may_be_changed():
         assert torch.equal(ask(x[0]), kept)
 
 
-@numba_here
 def test_arrays_follow_buffers_that_are_replaced():
     x, y = hard_stream(60)
     gp = pair("all")[1]
@@ -310,7 +298,6 @@ def test_without_numba_torch_does_it_all(monkeypatch):
     assert torch.equal(gp(x[0]), reference(x[0]))
 
 
-@numba_here
 def test_a_fresh_installation_learns_while_another_process_compiles(monkeypatch):
     class Compiler:
         result = None
@@ -341,7 +328,6 @@ def test_a_fresh_installation_learns_while_another_process_compiles(monkeypatch)
     assert len(started) == 1
 
 
-@numba_here
 def test_loops_that_are_compiled_are_not_compiled_again():
     assert loading._is_cached()
     loops = importlib.import_module(loading._LAST)
@@ -349,7 +335,6 @@ def test_loops_that_are_compiled_are_not_compiled_again():
     assert own[-1] == loading._LAST_LOOP
 
 
-@numba_here
 def test_where_numba_can_write_no_cache_torch_does_it_all():
     code = (
         "import numba.core.caching as caching, torch; caching.CacheImpl._locator_classes = []\n"

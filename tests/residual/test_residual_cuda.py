@@ -1,7 +1,5 @@
 """On a GPU: the same numbers, and no update or prediction waits for the device."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from as_published import sogp

@@ -1,7 +1,5 @@
 """What a stream of somebody else's may hold, and what somebody may ask: it works or is refused by name."""
 
-from __future__ import annotations
-
 import copy
 import itertools
 from collections.abc import Callable
@@ -51,11 +49,14 @@ def test_a_stationary_kernel_does_not_care_where_the_inputs_lie(offset):
     assert float(far.predict(queries + offset).stddev.min()) > 0.5 * float(near.predict(queries).stddev.min())
 
 
-@pytest.mark.parametrize(("offset", "bound"), [(1e6, 0.6), (1e8, 1.0)])
-def test_least_squares_far_from_the_origin(offset, bound):
-    x, _ = stream(200)
-    y = x @ torch.tensor([[1.0], [-2.0], [0.5]], dtype=torch.float64)
-    rls = RecursiveLeastSquares(3, 1)
+@pytest.mark.parametrize(
+    ("offset", "bound", "dtype"),
+    [(1e6, 0.6, torch.float64), (1e8, 1.0, torch.float64), (1e3, 0.3, torch.float32)],
+)
+def test_least_squares_far_from_the_origin(offset, bound, dtype):
+    x = stream(200)[0].to(dtype)
+    y = x @ torch.tensor([[1.0], [-2.0], [0.5]], dtype=dtype)
+    rls = RecursiveLeastSquares(3, 1, dtype=dtype)
     rls.update(x + offset, y)
     assert bool(rls(x + offset).isfinite().all())
     assert float((rls(x + offset) - y).square().mean().sqrt()) < bound * float(y.std())
@@ -144,7 +145,6 @@ def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
     fleet = sogp(3, 2, capacity=12, batch_shape=(2, 3), parts=[Standardize()])
     fleet.update(x, y, mask)
     units = fleet.units
-    assert units is not None
     units.input.settle(settled=0.0)
     units.output.settle(settled=0.0)
     for i, j in itertools.product(range(2), range(3)):

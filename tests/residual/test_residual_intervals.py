@@ -1,7 +1,5 @@
 """Laws of y: cumulative, quantiles, intervals."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Targets that come some samples after their inputs."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from as_published import sogp

@@ -1,7 +1,5 @@
 """The protocol of a learner's parts: order, copies, reset, reload, masks, and what does not go together."""
 
-from __future__ import annotations
-
 import copy
 import threading
 import time
@@ -184,7 +182,7 @@ class _Spy(Part):
         super().__init__()
         self.calls, self.name = calls, name
 
-    def __deepcopy__(self, memo: dict) -> _Spy:
+    def __deepcopy__(self, memo: dict):
         return type(self)(self.calls, self.name)
 
     def bind(self, learner):
@@ -271,16 +269,6 @@ def test_a_change_clears_what_parts_kept():
     assert "a forget" in calls
 
 
-def test_units_before_or_behind_process_noise_is_told_apart():
-    """Both are meaningful; the list says which."""
-    x, y = stream(60)
-    before = learner([Standardize(), ProcessNoise(0.2)])
-    behind = learner([ProcessNoise(0.2), Standardize()])
-    for g in (before, behind):
-        g.update(x, y)
-    assert not same(before, behind, x)
-
-
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("parts", "message"),
@@ -307,6 +295,9 @@ def test_a_learner_tells_its_parts():
         assert told in text
     assert learner(PARTS["all"]).part(ForgettingFactor).factor == 0.98  # type: ignore[union-attr]
     assert learner([]).part(ForgettingFactor) is None
+    bare = repr(SparseOnlineGP(3, 1))
+    assert "0 of 100 basis vectors" in bare
+    assert "ProcessNoise(share=0.001)" in bare
 
 
 def test_at_most_a_dozen_arguments():

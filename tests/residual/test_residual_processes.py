@@ -1,9 +1,6 @@
 """A learner in threads, in other processes, and on a screen; targets without an axis of their own."""
 
-from __future__ import annotations
-
 import multiprocessing
-import os
 import threading
 
 import pytest
@@ -36,8 +33,6 @@ def _learn(learner, done) -> None:
 @pytest.mark.parametrize("method", ["spawn", "fork"])
 def test_what_another_process_learns_is_not_learned_here(method):
     """torch shares a tensor's memory with a process to which it is sent."""
-    if method not in multiprocessing.get_all_start_methods():
-        pytest.skip(f"there is no {method} here")
     learner, _ = learned(SparseOnlineGP)
     x = torch.full((2,), 0.1)
     before = learner(x).item()
@@ -50,7 +45,6 @@ def test_what_another_process_learns_is_not_learned_here(method):
     assert learner(x).item() == before != there
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork here")
 def test_a_fork_while_another_thread_updates_goes_on():
     """Its lock would be held for ever there; torch's threads would be waited for."""
     learner, x = learned(lambda d, m: SparseOnlineGP(d, m, kernel=LinearKernel(d)))
@@ -121,9 +115,3 @@ def test_a_print_fits_on_a_screen_and_says_what_is_known(make):
     for told, weights in zip(of_learners, learner.weights.unbind(-1), strict=True):
         found = torch.tensor([float(w) for w in told.split(", ")], dtype=torch.float64)  # one where equal
         torch.testing.assert_close(found.expand_as(weights), weights, rtol=0.0, atol=0.01)
-
-
-def test_a_sparse_gp_prints_its_parts():
-    text = repr(SparseOnlineGP(3, 1))
-    assert "0 of 100 basis vectors" in text
-    assert "ProcessNoise(share=0.001)" in text

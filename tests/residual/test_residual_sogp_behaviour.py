@@ -1,7 +1,5 @@
 """What a working robot needs of the learner: it never breaks, adapts, forgets, distrusts, recovers."""
 
-from __future__ import annotations
-
 import copy
 import math
 

@@ -1,7 +1,5 @@
 """What the sparse online GP must equal, each against an independent dense computation."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Streams, scores and the real hand's recordings, where they are at hand (``TORCH_EKM_DATA``)."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
@@ -13,9 +11,9 @@ import torch
 from as_published import sogp
 
 from torch_ekm.experiments import compare
-from torch_ekm.experiments.learner_comparison.prequential import Prequential, run_prequential
+from torch_ekm.experiments.learner_comparison.prequential import Prequential
 from torch_ekm.experiments.learner_comparison.recordings import load_t42
-from torch_ekm.residual import CalibrateNoise, ForgettingFactor, RecursiveLeastSquares, RobustWeight
+from torch_ekm.residual import CalibrateNoise, ForgettingFactor, RobustWeight
 
 DATA = os.environ.get("TORCH_EKM_DATA", "")
 needs_data = pytest.mark.skipif(
@@ -29,14 +27,6 @@ def test_scores_by_hand():
     assert float(run.coverage()) == pytest.approx(0.75)  # |error| is .5, 1, 1.5, 2
     expected = 0.5 * np.log(2 * np.pi) + 0.125 * float(y.square().mean())
     assert run.nll() == pytest.approx(expected)
-
-
-def test_prediction_comes_before_learning():
-    x = torch.ones(2, 1, dtype=torch.float64)
-    y = torch.full((2, 1), 3.0, dtype=torch.float64)
-    run = run_prequential(RecursiveLeastSquares(1, 1), x, y)
-    assert float(run.mean[0]) == 0.0
-    assert float(run.mean[1]) > 2.5
 
 
 def test_a_regression_set_is_drawn_by_a_seed(tmp_path, monkeypatch):
@@ -70,7 +60,6 @@ def test_the_learner_helps_on_a_real_hand():
     assert 0.85 < score.coverage < 0.95
 
 
-@pytest.mark.slow
 def test_the_benchmark_of_the_default_learner_runs(tmp_path, capsys):
     default_learner.main(["--quick", "--out", str(tmp_path)])
     told = capsys.readouterr().out

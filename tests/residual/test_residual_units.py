@@ -1,7 +1,5 @@
 """A learner made from its two sizes takes care of units: whatever they are, and however the stream begins."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from as_published import share_left
@@ -98,14 +96,6 @@ def test_huge_numbers_stay_finite(make):
     law = learner.predict(x[:9] * 1e150)
     assert bool(law.mean.isfinite().all() and law.stddev.isfinite().all())
     assert bool((law.mean != 0).any())
-
-
-def test_least_squares_in_single_precision_far_from_the_origin():
-    x, y = stream(200)
-    learner = RecursiveLeastSquares(3, 2, dtype=torch.float32)
-    learner.update(x.float() + 1000.0, y.float())
-    far = learner(x.float() + 1000.0).double()
-    assert float((far - y)[:, 1].square().mean().sqrt() / y[:, 1].square().mean().sqrt()) < 0.3
 
 
 @pytest.mark.parametrize("kind", ["sogp", "deep", "default", "rls", "rff"])

@@ -1,5 +1,4 @@
-from __future__ import annotations
-
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -7,7 +6,6 @@ import torch
 from torch_ekm.kinematics.poses import exp
 from torch_ekm.simulation import SimulatedCamera
 
-cv2 = pytest.importorskip("cv2")
 cv2.setNumThreads(1)
 
 

@@ -1,7 +1,5 @@
 """A hand with an object before the camera, and a plant that is known through its sensors only."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

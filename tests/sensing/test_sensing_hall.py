@@ -1,7 +1,5 @@
 """Hall channels and their calibration."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

@@ -1,9 +1,8 @@
 """Drawn images, through lenses that distort, too; the pose of one board in them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,8 +14,6 @@ from torch_ekm.sensing.tracker import estimate_board_pose, projection_jacobian
 from torch_ekm.simulation import SimulatedCamera
 from torch_ekm.simulation.imaging import simulated_camera
 from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard
-
-cv2 = pytest.importorskip("cv2")
 
 
 @pytest.fixture

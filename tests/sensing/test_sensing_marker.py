@@ -1,9 +1,8 @@
 """The tracker: object in hand, covariance, and the reasons why there is no pose."""
 
-from __future__ import annotations
-
 import dataclasses
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -13,8 +12,6 @@ from torch_ekm.kinematics.poses import exp, log
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, Track, TrackStatus
 from torch_ekm.sensing.tracker import BoardPose
 from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard
-
-cv2 = pytest.importorskip("cv2")
 
 PALM, OBJECT = MarkerBoard(0), MarkerBoard(4)
 

@@ -1,7 +1,5 @@
 """Joints without a sensor are found by touch."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import math
@@ -116,9 +114,7 @@ def test_an_error_that_no_contact_shows_stays_uncertain(hand: SimulatedHand) -> 
 
 
 @pytest.mark.parametrize(("joint", "error_deg"), [("index_1", -6.0), ("index_2", -10.0)])
-def test_a_dead_sensor_is_found_by_a_pad_that_presses(
-    hand: SimulatedHand, joint: str, error_deg: float
-) -> None:
+def test_a_dead_sensor_is_found_by_a_pad_that_presses(hand, joint, error_deg):
     """The abduction, known by a cable, moves to its stop, and the gap is open still. Joints of one tendon are
     not always told apart."""
     names = hand.hand.joint_names

@@ -1,7 +1,5 @@
 """A grasp that tests of disturbances begin with."""
 
-from __future__ import annotations
-
 import pytest
 
 from torch_ekm.simulation import SimulatedHand

@@ -1,7 +1,5 @@
 """Measures that several tests of the plant share."""
 
-from __future__ import annotations
-
 import math
 
 import torch

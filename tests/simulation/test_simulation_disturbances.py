@@ -1,7 +1,5 @@
 """Each disturbance changes what it should, by the right amount, and nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,9 +8,6 @@ from simulation_helpers import DEG, ROLL, SQUEEZE, increment, motion, truth, tur
 from torch_ekm.exceptions import ParameterError
 from torch_ekm.plant import Plant, PlantStatus
 from torch_ekm.simulation import PRESETS, DisturbedPlant, PlantChange, PlantParameters, SimulatedHand, Tug
-
-pytest.importorskip("sapien")
-
 
 # -- the mechanism ------------------------------------------------------------------------------------
 

@@ -1,6 +1,4 @@
-"""The Gymnasium environment of examples/gymnasium_environment.py; the example itself turns an object with it."""
-
-from __future__ import annotations
+"""The Gymnasium environment of examples/gymnasium_environment.py; the example itself turns an object."""
 
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Movements through waypoints, and the rest after a motion, in both engines."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

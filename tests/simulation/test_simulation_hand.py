@@ -1,7 +1,5 @@
 """The simulated hand: grasp, hold, repeat, restore, lose."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 import sys
@@ -24,8 +22,6 @@ from torch_ekm.exceptions import (
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Plant, PlantStatus
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand, preset
-
-pytest.importorskip("sapien")
 
 
 @pytest.fixture(scope="module")

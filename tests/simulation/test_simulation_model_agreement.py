@@ -1,7 +1,5 @@
 """Two independent implementations of one hand: PhysX and the kinematic model."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -14,8 +12,6 @@ from torch_ekm.exceptions import ParameterError
 from torch_ekm.kinematics.poses import log
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
-
-pytest.importorskip("sapien")
 
 STEP = 0.1 * DEG  # small enough that no contact slips
 

@@ -1,7 +1,5 @@
 """Planned pinches against an independent account of contacts and forces; what would make one hold."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

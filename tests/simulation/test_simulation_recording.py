@@ -1,9 +1,8 @@
 """What was recorded comes back as it was."""
 
-from __future__ import annotations
-
 import dataclasses
 
+import h5py
 import pytest
 import torch
 from made_up import trajectory
@@ -13,7 +12,6 @@ from torch_ekm.plant import Plant, PlantStatus, ReplayedPlant, Trajectory
 from torch_ekm.plant.trajectory import read_trial, write_trial
 from torch_ekm.simulation import Tug
 
-h5py = pytest.importorskip("h5py")
 TUG = Tug(at=1, force=(0.0, 0.0, 5.0))
 
 

@@ -1,7 +1,5 @@
 """Disturbances of the sensors: they spoil their own reading and never the truth."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -10,9 +8,6 @@ from simulation_helpers import DEG, ROLL, SQUEEZE, truth
 from torch_ekm.kinematics.poses import log
 from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import PlantParameters, SimulatedHand
-
-pytest.importorskip("sapien")
-
 
 SENSOR_DISTURBANCES = {
     "joint_noise": 1.0 * DEG,

@@ -1,7 +1,5 @@
 """The position controller and its faults."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
