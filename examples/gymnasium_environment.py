@@ -22,11 +22,11 @@ class InHandRotation(gymnasium.Env):
     """Turn a pinched object about the axis of its grasp, by increments of the actuators.
 
     Action, in [-1, 1]: increment of each actuator in units of STEP_LIMIT. Observation, as the sensors say and
-    never the truth: joint angles, encoders [rad], position [m] and rotation vector [rad] of the object since the
-    reset, forces of the fingertips [N], angle turned and angle still to turn about the grasp's axis [rad].
+    never the truth: joint angles, encoders [rad], position [m] and rotation vector [rad] of the object since
+    the reset, forces of the fingertips [N], angle turned and angle still to turn about the grasp's axis [rad].
     """
 
-    def __init__(self, angles=(np.radians(5), np.radians(25)), **options):
+    def __init__(self, angles=(0.09, 0.44), **options):
         self.plant, self.angles = SimulatedHand(**options), angles  # least and largest target [rad]
         hand = self.plant.hand
         entries = hand.n_q + hand.n_a + 6 + len(hand.pads) + 2
