@@ -23,7 +23,7 @@ class InHandRotation(gymnasium.Env):
 
     Action, in [-1, 1]: increment of each actuator in units of STEP_LIMIT. Observation, as the sensors say and
     never the truth: joint angles, encoders [rad], position [m] and rotation vector [rad] of the object since
-    the reset, forces of the fingertips [N], angle turned and angle still to turn about the grasp's axis [rad].
+    the reset, forces of the fingertips [N], angle turned and still to turn about the grasp's axis [rad].
     """
 
     def __init__(self, angles=(0.09, 0.44), **options):
