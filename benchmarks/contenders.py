@@ -35,7 +35,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.experiments.config import Setting
 from torch_ekm.experiments.runner import Bench
-from torch_ekm.kinematics.poses import hat
+from torch_ekm.kinematics.se3 import hat
 from torch_ekm.model import KinematicModel, Linearization
 from torch_ekm.model.stiffness import posture_stiffness
 from torch_ekm.plant import Observation, Plant, PlantStatus

@@ -41,7 +41,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control.guards import Effect, ReadingTests
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
 from torch_ekm.simulation import SimulatedHand

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import torch
 
-from torch_ekm.kinematics.poses import log
+from torch_ekm.kinematics.se3 import log
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import SimulatedHand

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation, PlantStatus, Trajectory, Truth
 
 

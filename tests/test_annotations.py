@@ -11,7 +11,7 @@ import torch
 from torch_ekm.contact import ContactSet
 from torch_ekm.control.tasks import contact_travel
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.kinematics.poses import hat
+from torch_ekm.kinematics.se3 import hat
 from torch_ekm.model.reduction import planar_pose_basis
 from torch_ekm.residual import UpdateReport, ZeroResidual
 

@@ -17,7 +17,7 @@ from torch_ekm.contact.pad_contact import point_distance, signed_distance, surfa
 from torch_ekm.description import ContactPad, ObjectDescription, Shape, load_hand, load_object
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.simulation.physics.links import x_axis_to
 
 F64 = torch.float64

@@ -16,7 +16,7 @@ from torch_ekm.contact.contacts import (
     rolling_mobility,
     selected_rows,
 )
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 
 
 def test_contact_frames_are_rotations_with_the_inward_normal_first():

@@ -10,7 +10,7 @@ from light_plant import Obedient as Obedient
 
 from torch_ekm.control import ClosedLoop, LookAndMoveController, Manipulation, PoseTarget, Step
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation
 
 

@@ -22,7 +22,7 @@ from torch_ekm.control import StopReason as Reason
 from torch_ekm.control.program import ControlProblem
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import EKMError, ParameterError, SolverError
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation, Plant, PlantStatus
 
 DEG = math.pi / 180

@@ -16,7 +16,7 @@ from torch_ekm.control import (
 )
 from torch_ekm.control import StopReason as Reason
 from torch_ekm.enhanced import EnhancedModel
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation
 
 DEG = torch.pi / 180

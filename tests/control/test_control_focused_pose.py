@@ -22,7 +22,7 @@ from torch_ekm.control.ends import out_of_reach
 from torch_ekm.enhanced import EnhancedModel
 from torch_ekm.exceptions import NonFiniteError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import SimulatedHand
 

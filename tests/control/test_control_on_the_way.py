@@ -19,7 +19,7 @@ from torch_ekm.control import (
     StopReason,
 )
 from torch_ekm.control.watch import OnTheWay
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.plant import Observation, PlantStatus, Stamps
 
 DEG = math.pi / 180

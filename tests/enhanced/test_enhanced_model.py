@@ -15,7 +15,8 @@ from torch_ekm.exceptions import (
     ShapeError,
     UnknownNameError,
 )
-from torch_ekm.kinematics.poses import GraspState, exp
+from torch_ekm.kinematics.poses import GraspState
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.residual import MixtureResidual, RecursiveLeastSquares, ReplayMLP, SparseOnlineGP
 
 N_S, N_A = 3, 2

@@ -21,7 +21,7 @@ from own_files import change, copied
 from torch_ekm.description import HandDescription, load_hand
 from torch_ekm.exceptions import ParameterError, ShapeError, UnknownNameError
 from torch_ekm.kinematics import HandKinematics
-from torch_ekm.kinematics.poses import hat
+from torch_ekm.kinematics.se3 import hat
 
 HANDS = ("icub_right", "icub_left", "planar_two_finger")
 SHAPES = ((), (1,), (5,), (2, 3), (0,))

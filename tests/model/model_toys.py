@@ -14,7 +14,7 @@ from torch_ekm.contact.contacts import SHARED, VARYING, ContactSet, constraint_m
 from torch_ekm.description import Actuator, HandDescription
 from torch_ekm.description.urdf import UrdfModel
 from torch_ekm.kinematics import GraspState, LinkPoses
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel
 from torch_ekm.model.stiffness import gravity_gradient
 

@@ -22,7 +22,7 @@ from torch_ekm.contact import ForceStatus
 from torch_ekm.contact.contacts import constraint_matrix
 from torch_ekm.exceptions import NoContactError, PenetrationError, SingularGraspError, UnstableGraspError
 from torch_ekm.kinematics import GraspState
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.model import KinematicModel, ModelStatus
 from torch_ekm.model.reduction import two_stage
 

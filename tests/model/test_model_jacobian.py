@@ -21,7 +21,7 @@ from model_toys import (
 from scipy.optimize import minimize
 
 from torch_ekm.contact.contacts import contact_frames
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 
 STEP = 2e-5  # [rad] of a motor
 

@@ -8,7 +8,7 @@ import torch
 from fakes import FakePlant, ScriptedPlant
 
 from torch_ekm.exceptions import NonFiniteError, ParameterError, StateError
-from torch_ekm.kinematics.poses import exp, log
+from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import (
     FramesAtRest,
     Observation,

@@ -10,7 +10,7 @@ import trimesh
 from torch_ekm.description import list_hands, load_hand, load_object, write_template
 from torch_ekm.description.urdf import read_urdf
 from torch_ekm.exceptions import DescriptionError, EKMError
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.rendering import make_scene, save_picture
 from torch_ekm.rendering.scene import shape_mesh
 from torch_ekm.rendering.visuals import Mesh, visuals

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from torch_ekm.kinematics.poses import exp
+from torch_ekm.kinematics.se3 import exp
 from torch_ekm.simulation import SimulatedCamera
 
 cv2.setNumThreads(1)

@@ -10,7 +10,7 @@ from fakes import FakePlant
 from torch_ekm.description import load_hand, load_object
 from torch_ekm.exceptions import ObjectLostError, ParameterError, StateError
 from torch_ekm.kinematics import GraspState, HandKinematics
-from torch_ekm.kinematics.poses import exp, log
+from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.plant import Observation, Plant, PlantStatus, Truth
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, TrackStatus
 from torch_ekm.simulation import HallSensors, SensedPlant

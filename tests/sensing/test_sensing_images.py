@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ParameterError, ShapeError
-from torch_ekm.kinematics.poses import exp, log
+from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, PinholeCamera, tracker
 from torch_ekm.sensing.tracker import estimate_board_pose, projection_jacobian
 from torch_ekm.simulation import SimulatedCamera

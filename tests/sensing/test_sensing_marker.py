@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torch_ekm.exceptions import ObjectLostError, ParameterError, ShapeError
-from torch_ekm.kinematics.poses import exp, log
+from torch_ekm.kinematics.se3 import exp, log
 from torch_ekm.sensing import MarkerBoard, MarkerTracker, PinholeCamera, Track, TrackStatus
 from torch_ekm.sensing.tracker import BoardPose
 from torch_ekm.simulation.imaging.card_scene import CardScene, ConvexBody, PlacedCard

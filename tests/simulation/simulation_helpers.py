@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from torch_ekm.kinematics.poses import log
+from torch_ekm.kinematics.se3 import log
 from torch_ekm.plant import Observation
 
 DEG = math.pi / 180

@@ -9,7 +9,7 @@ from turning_step import true_state, turning_step
 
 from torch_ekm.exceptions import UnknownNameError
 from torch_ekm.experiments.config import Setting
-from torch_ekm.kinematics.poses import log
+from torch_ekm.kinematics.se3 import log
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation, PlantStatus
 from torch_ekm.simulation import SimulatedHand, preset

@@ -9,7 +9,7 @@ from simulation_helpers import DEG
 
 from torch_ekm.description import load_hand
 from torch_ekm.exceptions import ParameterError
-from torch_ekm.kinematics.poses import log
+from torch_ekm.kinematics.se3 import log
 from torch_ekm.model import KinematicModel
 from torch_ekm.simulation import PlantConfig, PlantParameters, SimulatedHand
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from simulation_helpers import DEG, ROLL, SQUEEZE, truth
 
-from torch_ekm.kinematics.poses import log
+from torch_ekm.kinematics.se3 import log
 from torch_ekm.plant import PlantStatus
 from torch_ekm.simulation import PlantParameters, SimulatedHand
 

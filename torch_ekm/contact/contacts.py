@@ -13,7 +13,7 @@ import torch
 
 from .._arrays import as_tensors, eye, like, namespace, zeros
 from ..exceptions import NonFiniteError, ParameterError, ShapeError
-from ..kinematics.poses import cross, hat
+from ..kinematics.se3 import cross, hat
 from ..typing import AnyArray, Bool, Float, Tensor
 
 CHARACTERISTIC_LENGTH = 0.03

@@ -11,7 +11,8 @@ import torch
 from .._arrays import as_tensors, null_space
 from .._checks import check_finite, check_kind, check_positive, check_shape
 from ..exceptions import NonFiniteError, ParameterError, UnknownNameError
-from ..kinematics.poses import A_STATE, GraspState, check_rotation, exp, log
+from ..kinematics.poses import A_STATE, GraspState, check_rotation
+from ..kinematics.se3 import exp, log
 from ..typing import Float, Tensor
 
 A_TARGET = "a PoseTarget, e.g. PoseTarget.turned(state, axis, degrees=20)"

@@ -13,7 +13,7 @@ from .._checks import check_positive
 from .._noise import DEGREE
 from ..description import HandDescription
 from ..exceptions import ParameterError, UnknownNameError
-from ..kinematics.poses import hat
+from ..kinematics.se3 import hat
 from ..model import Linearization
 from ..typing import Array, Float, Tensor
 from .decision import Decision

@@ -14,7 +14,7 @@ from ..control import ClosedLoop, LookAndMoveController, Reach
 from ..description import HandDescription, load_hand, load_object
 from ..exceptions import DescriptionError, ParameterError
 from ..kinematics import ActuationMap, GraspState
-from ..kinematics.poses import log as rotation_vector
+from ..kinematics.se3 import log as rotation_vector
 from ..model import KinematicModel
 from ..plant import Observation, PlantStatus, Trajectory, TrialLog
 from ..rendering import Captions, Scene, make_scene

@@ -14,7 +14,8 @@ import torch
 from .._arrays import in_torch, of_fields
 from ..contact.detector import ContactDetector
 from ..exceptions import GraspEndsError, GraspError, NoContactError
-from ..kinematics.poses import GraspState, exp
+from ..kinematics.poses import GraspState
+from ..kinematics.se3 import exp
 from ..typing import Array, Float, Tensor
 from .contact_laws import Response, StepSolution, solve
 from .linearization import Linearization

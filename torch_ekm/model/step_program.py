@@ -22,7 +22,8 @@ from ..contact.contacts import (
 from ..contact.forces import ForceStatus, friction_cones, margins
 from ..description.hand import HandDescription
 from ..exceptions import NoContactError
-from ..kinematics.poses import GraspState, Kinematics, LinkPoses, hat
+from ..kinematics.poses import GraspState, Kinematics, LinkPoses
+from ..kinematics.se3 import hat
 from ..typing import AnyArray, Array, Tensor
 from .contact_laws import Response, StepProblem, StepSolution
 from .grasp_forces import pack_forces

@@ -10,7 +10,7 @@ import torch
 from .._arrays import eye, like, namespace, zeros
 from ..contact.contacts import ContactKinematics
 from ..description.hand import HandDescription
-from ..kinematics.poses import cross, hat
+from ..kinematics.se3 import cross, hat
 from ..typing import AnyArray, Array, Bool, Float, Tensor
 
 

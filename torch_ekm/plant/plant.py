@@ -15,7 +15,7 @@ from .._checks import check_count, check_finite, check_kind, check_positive, che
 from ..description import HandDescription
 from ..exceptions import ParameterError, ShapeError
 from ..kinematics import GraspState
-from ..kinematics.poses import exp, log
+from ..kinematics.se3 import exp, log
 from ..typing import Float, Tensor
 
 

@@ -17,7 +17,7 @@ from .._extras import require
 from ..description import HandDescription, ObjectDescription, Shape
 from ..exceptions import DescriptionError, EKMError
 from ..kinematics import HandKinematics
-from ..kinematics.poses import log
+from ..kinematics.se3 import log
 from ..typing import Array
 from . import drawing
 from .visuals import Mesh, visuals

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .._extras import require
 from ..exceptions import ObjectLostError, ParameterError, ShapeError
-from ..kinematics.poses import hat
+from ..kinematics.se3 import hat
 from ..typing import Array, Float, Tensor
 from .camera import MarkerBoard, PinholeCamera, dictionary
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..kinematics.poses import exp, log
+from ..kinematics.se3 import exp, log
 from ..typing import Array
 from .parameters import PlantParameters
 

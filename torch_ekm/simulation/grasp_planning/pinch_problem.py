@@ -14,7 +14,7 @@ from ...description import HandDescription, ObjectDescription
 from ...exceptions import UnknownNameError
 from ...kinematics import HandKinematics
 from ...kinematics.equilibrium import FreeHand
-from ...kinematics.poses import cross, exp
+from ...kinematics.se3 import cross, exp
 from ...typing import Array
 from ..mechanism.assembly import chain
 from ..mechanism.transmission import Transmission
