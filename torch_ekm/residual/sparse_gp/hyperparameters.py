@@ -264,7 +264,7 @@ class LearnHyperparameters(Part):
         return {**self.kernel.hyperparameters(), "log_noise": self.log_noise}
 
     def pairs(self, learner: Host) -> list[tuple[Tensor, Tensor]]:
-        """Both, of each parameter."""
+        """Where steps lead to, and what is in use, of each parameter."""
         known = None if learner.engine is None else learner.engine.pairs(learner)
         return known or list(zip(self.ahead().values(), self.theta(learner).values(), strict=True))
 
