@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import torch
 
+from torch_ekm.control.program import of_pads
 from torch_ekm.exceptions import GraspError
 from torch_ekm.model import KinematicModel
 from torch_ekm.plant import Observation
@@ -90,9 +91,10 @@ class Obedient:
                 lin = self.model.linearize(self.state)
                 self.state = self.state.plus(self.gain * lin.step(moved))
                 if self.force is not None:
-                    pads = torch.tensor(self.model.hand.pad_indices(lin.contacts.finger))
-                    change = lin.normal_force_sensitivity @ moved
-                    self.force = self.force.index_add(0, pads, change).clamp(min=0.0)
+                    change = of_pads(
+                        self.model.hand, lin.contacts.finger, lin.normal_force_sensitivity @ moved
+                    )
+                    self.force = (self.force + change).clamp(min=0.0)
         self.a = self.a + moved
         return self.observe()
 

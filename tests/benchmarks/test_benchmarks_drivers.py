@@ -37,4 +37,4 @@ def test_spoilt_messages_send_no_motor_beyond_its_limits(bus, tmp_path) -> None:
 
 
 def test_a_cable_that_is_pulled_ends_the_turn_with_its_cause(bus, tmp_path) -> None:
-    assert module.pulls(bus, tmp_path, 1) == 1
+    assert module.pulls(bus, tmp_path, 2) == 2

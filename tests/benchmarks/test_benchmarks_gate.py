@@ -1,4 +1,4 @@
-"""The benchmark of the last gate, with 400 readings, and that it would see what it is to find."""
+"""The benchmark of the last gate, with 2,000 readings, and that it would see what it is to find."""
 
 import gate
 import pytest
@@ -7,9 +7,9 @@ from torch_ekm.plant import ServoInverse
 
 
 def test_searched_faults_bring_no_command_above_the_increment_and_teach_nothing() -> None:
-    count = gate.search(400, each=100, seed=0)
-    assert count.readings >= 400
-    assert count.commands > 200
+    count = gate.search(2000, each=250, seed=0)
+    assert count.readings >= 2000
+    assert count.commands > 1000
     assert (count.above, count.not_finite, count.outside, count.learned) == (0, 0, 0, 0)
     assert len(count.reasons) > 5  # faults of many kinds were found out
 

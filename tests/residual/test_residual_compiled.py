@@ -347,3 +347,11 @@ def test_where_numba_can_write_no_cache_torch_does_it_all():
     assert done.returncode == 0, done.stderr
     assert "SpeedWarning: compiled loops are off" in done.stderr  # said once, not silent
     assert done.stderr.count("NUMBA_CACHE_DIR") == 1
+
+
+def test_loops_that_another_process_takes_away_meanwhile_are_no_failure(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    (tmp_path / "loops").mkdir()
+    name = f"numba_mixture.mix_fleet-1.py{sys.version_info.major}{sys.version_info.minor}.nbi"
+    (tmp_path / "loops" / name).symlink_to(tmp_path / "gone")
+    assert not loading._is_cached()

@@ -20,7 +20,16 @@ from ..model import ContactMotion, KinematicModel, Linearization, ModelStatus
 from ..typing import Float, Tensor
 from .decision import Decision, Expectation, Grip, Piece, StopReason, made_of, shares
 from .focus import A_TARGET, FocusedPose, PoseTarget
-from .program import DEGREE, ControlProblem, ControlSolution, LinearizedModel, Situation, as_array, build_qp
+from .program import (
+    DEGREE,
+    ControlProblem,
+    ControlSolution,
+    LinearizedModel,
+    Situation,
+    as_array,
+    build_qp,
+    of_pads,
+)
 from .tasks import DEFAULT_LIMITS, DEFAULT_TASKS, Limit, LimitingFunction, StepBound, Task, contact_travel
 
 _BOUND = StepBound()
@@ -124,14 +133,14 @@ class LookAndMoveController:
                 deviation = deviation + variance.sqrt()  # g errs alike along a path
             f, both = f.plus(nominal), both.plus(nominal + g)
             lin = one.linearization
-            said = one.said + self._of_pads(lin, lin.described_normal_sensitivity @ part, 0.0)
+            said = one.said + self._of_pads(lin, lin.described_normal_sensitivity @ part)
             made.append(Piece(lin, w, nominal, nominal + g, one.force, said))
         nominal, increment = made[0].nominal, made[0].increment
         if len(made) > 1:
             nominal, increment = f.minus(start), both.minus(start)
         lin, normal = last.linearization, last.force
         if normal is not None:
-            normal = normal + self._of_pads(lin, lin.normal_force_sensitivity @ extra, 0.0)
+            normal = normal + self._of_pads(lin, lin.normal_force_sensitivity @ extra)
         return Expectation(moved, nominal, increment, deviation, tuple(made), normal)
 
     def went(self, a: Float[Tensor, " n_a"], pieces: Sequence[Piece]) -> None:
@@ -272,7 +281,7 @@ class LookAndMoveController:
         slack = float(np.abs(solution.slack).max(initial=0.0))
         asked = float((self.focus.tolerance_scale * seen.desired).abs().max())
         limited = slack > 0.05 * asked and self._at_limit(seen.a, da, problem)
-        said = self._of_pads(lin, lin.described_normal_sensitivity @ da, 0.0)
+        said = self._of_pads(lin, lin.described_normal_sensitivity @ da)
         force = seen.normal_force(lin)
         if force is not None:
             force = torch.from_numpy(force + (0.0 if seen.drift is None else seen.drift))
@@ -283,13 +292,8 @@ class LookAndMoveController:
             slack, grip=self.grip(lin, seen),
         )  # fmt: skip
 
-    def _of_pads(self, lin: Linearization, values: Tensor, nothing: float) -> Tensor:
-        """What is known of the contacts, of each pad of the hand ``(n_pads,)``; ``nothing`` where it does not
-        touch."""
-        rows, pads = self.kinematic.hand.pad_rows(lin.contacts.finger)
-        found = values.new_full((len(self.kinematic.hand.pads),), nothing)
-        found[pads] = values[rows]
-        return found
+    def _of_pads(self, lin: Linearization, values: Tensor, nothing: float = 0.0) -> Tensor:
+        return of_pads(self.kinematic.hand, lin.contacts.finger, values, nothing)
 
     def grip(self, lin: Linearization, seen: Situation) -> Grip | None:
         """What the fingers bear and should bear; None where nothing is known or asked of it."""

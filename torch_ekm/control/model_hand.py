@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Iterable
 
 import torch
 
@@ -17,6 +16,7 @@ from ..kinematics import GraspState
 from ..model import ContactMotion, ContactStep, KinematicModel, Linearization
 from ..plant import Observation, PlantStatus
 from ..typing import Float, Tensor
+from .program import of_pads
 
 _NEAR_END = math.radians(0.1)
 
@@ -147,7 +147,7 @@ class ModelHand:
                 self.failure = GraspEndsError(str(lin.doubts[0]))
             self._motion = ContactMotion(self.kinematic, lin)
             self._linearization = self._motion.answered(lin)
-            self._bears = self._of_pads(lin.contacts.finger, lin.forces.normal.tolist())
+            self._bears = of_pads(self.hand, lin.contacts.finger, lin.forces.normal).to(self.a)
         except GraspError as error:
             self.failure = error
 
@@ -156,7 +156,7 @@ class ModelHand:
         force = self.force if self._measured else None
         contacts = self.kinematic.touching(self.state, force)
         lin = self.kinematic.linearize(self.state, contacts, fingertip_force=force, on_unstable="flag")
-        self._spare = self._of_pads(lin.contacts.finger, lin.forces.margin.tolist())
+        self._spare = of_pads(self.hand, lin.contacts.finger, lin.forces.margin).to(self.a)
         self._is_stale = False
         return lin
 
@@ -175,7 +175,7 @@ class ModelHand:
         self.increment = motion.state.minus(self.state)
         self.correction = torch.zeros_like(self.increment) if correction is None else correction
         self.state, self.a = motion.state, self.a + w
-        bears = self._of_pads(step.normal, step.normal.values())
+        bears = of_pads(self.hand, tuple(step.normal), self.a.new_tensor(list(step.normal.values())))
         before, self.said, self._bears = self.force, bears - self._bears, bears
         self._is_stale = True
         self.force = bears
@@ -202,8 +202,3 @@ class ModelHand:
             self._tried = motion, w, after, after.move(w)
         _, _, after, step = self._tried
         return copy.copy(after), step
-
-    def _of_pads(self, names: Iterable[str], values: Iterable[float]) -> Tensor:
-        """What contacts with these names bear, of each pad of the hand; 0 of one that does not touch [N]."""
-        found = dict(zip(names, values, strict=True))
-        return self.a.new_tensor([found.get(pad.name, 0.0) for pad in self.hand.pads])

@@ -6,7 +6,7 @@ It is solved for u in degrees: of the order of 1, like its rows.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,6 +24,16 @@ from ..typing import Array, Float, Tensor
 from .focus import FocusedPose
 
 Numbers = Tensor | Array | float
+
+
+def of_pads(
+    hand: HandDescription, names: Sequence[str], values: Float[Tensor, " n_c"], nothing: float = 0.0
+) -> Float[Tensor, " n_pads"]:
+    """A figure of each contact as one of each pad of the hand: ``nothing`` where that does not touch."""
+    rows, pads = hand.pad_rows(names)
+    found = values.new_full((len(hand.pads),), nothing)
+    found[pads] = values[rows]
+    return found
 
 
 @dataclass(frozen=True)

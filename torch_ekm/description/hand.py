@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -412,15 +412,6 @@ class HandDescription:
     @property
     def n_a(self) -> int:
         return len(self.actuators)
-
-    def pad_indices(self, names: Iterable[str]) -> list[int]:
-        """Places of the pads of these names among :attr:`pads`.
-
-        Raises:
-            ValueError: there is no such pad.
-        """
-        pads = [pad.name for pad in self.pads]
-        return [pads.index(name) for name in names]
 
     def pad_rows(self, names: Sequence[str]) -> tuple[list[int], list[int]]:
         """Which of the names are pads' and not links', and their places among :attr:`pads`."""

@@ -15,10 +15,8 @@ from .sparse_gp.part import Host
 from .tails import FREEDOM
 
 _KEPT = 2  # regimes
-_EVERY, _AT = (
-    64,
-    20,
-)  # samples between two copies of the present state, and the first: little else is due then
+_EVERY = 64  # samples between two copies of the present state
+_AT = 20  # samples before the first of them: little else is due then
 _REST = 32  # samples after a change or a return in which there is neither a copy nor a return
 _CALM = -0.5, 0.12  # level of DetectChanges at which a copy is of one regime alone
 _MEMORY, _ENOUGH, _MOST = 0.9, 8.0, 10.0  # of log evidence: forgotten, that a regime is back, of one sample
@@ -104,9 +102,8 @@ def _cost(y: AnyArray, mean: AnyArray, deviation: AnyArray) -> float:
 @torch.no_grad()
 def copy_state(to: nn.Module, of: nn.Module) -> None:
     """All that a learner has learned, into another one of its make."""
-    for new, old in zip(vars(to)["_buffers"].values(), vars(of)["_buffers"].values(), strict=True):
-        new.copy_(old)
-    if type(of).get_extra_state is not nn.Module.get_extra_state:
-        to.set_extra_state(of.get_extra_state())
-    for new, old in zip(vars(to)["_modules"].values(), vars(of)["_modules"].values(), strict=True):
-        copy_state(new, old)
+    for new, old in zip(to.modules(), of.modules(), strict=True):
+        for mine, his in zip(new.buffers(recurse=False), old.buffers(recurse=False), strict=True):
+            mine.copy_(his)
+        if type(old).get_extra_state is not nn.Module.get_extra_state:
+            new.set_extra_state(old.get_extra_state())

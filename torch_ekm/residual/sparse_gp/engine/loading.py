@@ -95,8 +95,11 @@ def _is_cached() -> bool:
     names = [f"{file.stem}.*.py{sys.version_info.major}{sys.version_info.minor}.nbi" for file in sources]
     folders = [Path(given)] if given else [Path(user_cache_dir("numba", False)), *{f.parent for f in sources}]
     found = {index for folder in folders for name in names for index in folder.glob(f"*/{name}")}
-    for index in (old for old in found if old.stat().st_mtime < written):
-        found = found - {index}
-        with contextlib.suppress(OSError):
-            index.unlink()
-    return any(f".{_LAST_LOOP}-" in index.name for index in found)
+    kept = []
+    for index in found:
+        with contextlib.suppress(OSError):  # another process may have taken it away by now
+            if index.stat().st_mtime < written:
+                index.unlink()
+            else:
+                kept.append(index)
+    return any(f".{_LAST_LOOP}-" in index.name for index in kept)
