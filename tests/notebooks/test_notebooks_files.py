@@ -6,6 +6,7 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import pytest
+from smoke import small
 
 from torch_ekm.cli.describe import copy_notebooks, notebook_folder
 from torch_ekm.exceptions import DescriptionError
@@ -39,6 +40,11 @@ def test_outputs_are_stored(name: str) -> None:
         text = json.dumps(output)
         assert "/tmp/" not in text
         assert "/home/" not in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_its_smallest_size_replaces_what_it_holds(name: str) -> None:
+    assert json.loads(small(notebook_folder() / name))["cells"]  # a ValueError names what is not there
 
 
 @pytest.mark.parametrize("name", NAMES)
