@@ -114,13 +114,11 @@ class OneStep:
         firm: float,
     ) -> Plan:
         """See :class:`Planner`."""
-        if firm:
+        decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
+        if firm and decision.grip is not None and decision.grip.weak:
             here = PoseTarget(seen.position, seen.rotation)
             grips = controller.decide(seen.state, seen.a, here, seen.fingertip_force)
-            if grips.grip is not None and grips.grip.weak:
-                grips = dataclasses.replace(grips, turns=False)
-                return Plan(target, controller.focus, seen.state, grips)
-        decision = controller.decide(seen.state, seen.a, target, seen.fingertip_force)
+            decision = dataclasses.replace(grips, turns=False)
         return Plan(target, controller.focus, seen.state, decision)
 
 
