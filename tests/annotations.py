@@ -1,4 +1,4 @@
-"""Shape annotations are checked in the first hundred calls of each test.
+"""Shape annotations are checked in the first fifty calls of each test.
 
 :mod:`jaxtyping` binds the sizes of a call to each other; :mod:`beartype` checks types. ``int`` is taken where
 ``float`` is annotated, as type checkers do (PEP 484).
@@ -14,33 +14,41 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 #: Checks of one test; the rest of its calls, most of them in long streams, repeat the same shapes.
-BUDGET = 100
+BUDGET = 50
 #: Packages whose annotations are checked.
 CHECKED: tuple[str, ...] = ("kinematics", "contact", "model", "residual", "enhanced", "control")
 
 
 _count = [0]
+_checked = functools.partial(
+    jaxtyping.jaxtyped, typechecker=beartype(conf=BeartypeConf(is_pep484_tower=True))
+)
 
 
-def check(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The type checker of the import hook, which also counts.
+def lazily(*, typechecker: None) -> Callable[..., Any]:
+    """In place of :func:`jaxtyping.jaxtyped`, which the import hook calls by this name: a function's checks
+    are made when it is first called, and past the budget calls go straight to it.
 
     A function within another is made, and would be compiled anew, in each call of it: it stays unchecked.
     """
-    if "<locals>" in function.__qualname__:
-        return function
-    checked = beartype(function, conf=BeartypeConf(is_pep484_tower=True))
-    if isinstance(checked, type):
-        return checked
 
-    @functools.wraps(checked)
-    def counted(*args: Any, **options: Any) -> Any:
-        _count[0] += 1
-        if _count[0] == BUDGET:
-            jaxtyping.config.update("jaxtyping_disable", True)
-        return checked(*args, **options)
+    def decorated(function: Callable[..., Any]) -> Callable[..., Any]:
+        if isinstance(function, type):
+            return _checked(function)
+        checked = functools.cache(lambda: _checked(function))
 
-    return counted
+        @functools.wraps(function)
+        def counted(*args: Any, **options: Any) -> Any:
+            if _count[0] >= BUDGET:
+                return function(*args, **options)
+            _count[0] += 1
+            if _count[0] == BUDGET:
+                jaxtyping.config.update("jaxtyping_disable", True)  # for dataclasses, too
+            return checked()(*args, **options)
+
+        return function if "<locals>" in function.__qualname__ else counted
+
+    return decorated
 
 
 def begin_test() -> None:
@@ -55,7 +63,8 @@ def install() -> None:
     packages = CHECKED if named is None else tuple(filter(None, named.split(",")))
     if packages:
         modules = [module for name in packages for module in _modules(name)]
-        jaxtyping.install_import_hook(modules, "annotations.check")
+        jaxtyping.jaxtyped = lazily
+        jaxtyping.install_import_hook(modules, None)
 
 
 def _modules(package: str) -> list[str]:

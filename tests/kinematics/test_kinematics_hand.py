@@ -55,10 +55,10 @@ def reference_transforms(hand: HandDescription, q: torch.Tensor) -> torch.Tensor
 def test_poses_to_the_last_digits(name: str) -> None:
     """In float64: the library's own reader would leave 1e-7 of its float32 origins."""
     hand, q = load_hand(name), 5 * postures(name, 2, 100)  # turns of more than pi, too
-    actual, expected = HandKinematics(hand)(q).transforms, reference_transforms(hand, q)
-    torch.testing.assert_close(actual, expected, atol=1e-12, rtol=0)
-    kinematics = HandKinematics(hand)
-    for k in range(5):  # a single posture goes another way
+    kinematics, expected = HandKinematics(hand), reference_transforms(hand, q)
+    for given in (q, q.clone().requires_grad_()):  # for derivatives the chain goes another way
+        torch.testing.assert_close(kinematics(given).transforms.detach(), expected, atol=1e-12, rtol=0)
+    for k in range(5):
         torch.testing.assert_close(kinematics(q[0, k]).transforms, expected[0, k], atol=1e-12, rtol=0)
 
 

@@ -211,24 +211,26 @@ class HandKinematics(nn.Module):
         if q.dtype != self._chain.dtype:
             valid = f"{self.dtype}, the dtype of this module (change it with .to())"
             raise ParameterError("q.dtype", q.dtype, valid)
-        if q.dim() == 1 and is_plain(q):
+        if is_plain(q):
             return LinkPoses(torch.from_numpy(self._by_exponentials(q.numpy())), self.link_names)
         return self._by_chain(q)
 
     def _by_exponentials(self, q: Array) -> Array:
         """``T_l(q) = prod_j exp(xi_j q_j) T_l(0)`` over the joints upstream of the link, xi_j at q = 0.
 
-        For one posture the chain takes four times as long.
+        The chain takes four times as long for one posture, twice for some tens.
         """
-        transforms, axis, origin, order, joint_of_link = self._at_zero
-        R = exp(axis * q[:, None])
-        moved = np.zeros((len(q) + 1, 4, 4))  # by each joint and those before it; the last: by none
-        moved[:, 3, 3] = 1.0
-        moved[:-1, :3, :3], moved[-1, :3, :3] = R, np.eye(3)
-        moved[:-1, :3, 3] = origin - (R @ origin[..., None])[..., 0]
+        *parts, order, joint_of_link = self._at_zero
+        q, many = np.moveaxis(q, -1, 0), (1,) * (q.ndim - 1)
+        transforms, axis, origin = (x.reshape(len(x), *many, *x.shape[1:]) for x in parts)
+        R = exp(axis * q[..., None])
+        moved = np.zeros((len(q) + 1, *R.shape[1:-2], 4, 4))  # by each joint and those before; last: by none
+        moved[..., 3, 3] = 1.0
+        moved[:-1, ..., :3, :3], moved[-1, ..., :3, :3] = R, np.eye(3)
+        moved[:-1, ..., :3, 3] = origin - (R @ origin[..., None])[..., 0]
         for j, before in order:
             moved[j] = moved[before] @ moved[j]
-        return moved[joint_of_link] @ transforms
+        return np.ascontiguousarray(np.moveaxis(moved[joint_of_link] @ transforms, 0, -3))
 
     @cached_property
     def _at_zero(self) -> tuple[Array, Array, Array, list[tuple[int, int]], list[int]]:
