@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, auto
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,15 +91,15 @@ class Guards:
 class Effect(IntEnum):
     """What follows where a test objects and another look does not help, the mildest first."""
 
-    TOLD = 0
+    TOLD = auto()
     """A note."""
-    UNLEARNED = 1
+    UNLEARNED = auto()
     """Nothing is learned of the motion; the loop goes on from what is seen, and plans again."""
-    LIES = 2
+    LIES = auto()
     """Nothing is learned of the whole manipulation."""
-    BLIND = 3
+    BLIND = auto()
     """The pose is not known, and predicted; the rest is."""
-    STOP = 4
+    STOP = auto()
     """The hand holds."""
 
 
