@@ -19,6 +19,7 @@ BUDGET = 50
 CHECKED: tuple[str, ...] = ("kinematics", "contact", "model", "residual", "enhanced", "control")
 
 
+__name__ = "jaxtyping.lazily"  # warnings name the line that led to what is checked
 _count = [0]
 _checked = functools.partial(
     jaxtyping.jaxtyped, typechecker=beartype(conf=BeartypeConf(is_pep484_tower=True))

@@ -308,4 +308,4 @@ def reach(
     target = PoseTarget.turned(seen.state, axis, sign * limit)
     plan = WholeTurn().plan(controller, seen, target, knowledge, 0.0, whole=True, longest=math.inf)
     turned = [float(axis @ state.minus(seen.state)[-3:]) for state in plan.states]
-    return Reach(turned[-1], plan.end, turned[plan.safe], plan)
+    return Reach(sign * max(sign * angle for angle in turned), plan.end, turned[plan.safe], plan)
