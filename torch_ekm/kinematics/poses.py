@@ -220,17 +220,16 @@ class HandKinematics(nn.Module):
 
         The chain takes four times as long for one posture, twice for some tens.
         """
-        *parts, order, joint_of_link = self._at_zero
-        q, many = np.moveaxis(q, -1, 0), (1,) * (q.ndim - 1)
-        transforms, axis, origin = (x.reshape(len(x), *many, *x.shape[1:]) for x in parts)
+        transforms, axis, origin, order, joint_of_link = self._at_zero
         R = exp(axis * q[..., None])
-        moved = np.zeros((len(q) + 1, *R.shape[1:-2], 4, 4))  # by each joint and those before; last: by none
+        # by each joint and those before it; the last: by none
+        moved = np.zeros((*q.shape[:-1], q.shape[-1] + 1, 4, 4))
         moved[..., 3, 3] = 1.0
-        moved[:-1, ..., :3, :3], moved[-1, ..., :3, :3] = R, np.eye(3)
-        moved[:-1, ..., :3, 3] = origin - (R @ origin[..., None])[..., 0]
+        moved[..., :-1, :3, :3], moved[..., -1, :3, :3] = R, np.eye(3)
+        moved[..., :-1, :3, 3] = origin - (R @ origin[..., None])[..., 0]
         for j, before in order:
-            moved[j] = moved[before] @ moved[j]
-        return np.ascontiguousarray(np.moveaxis(moved[joint_of_link] @ transforms, 0, -3))
+            moved[..., j, :, :] = moved[..., before, :, :] @ moved[..., j, :, :]
+        return moved.take(joint_of_link, axis=-3) @ transforms
 
     @cached_property
     def _at_zero(self) -> tuple[Array, Array, Array, list[tuple[int, int]], list[int]]:
