@@ -21,7 +21,7 @@ from .part import Host, Part
 from .posterior import SparsePosterior
 from .units import Standardize
 
-_REPLAYED = 2  # samples of the memory per sample of the window, in each step
+_REPLAYED = 4  # samples of the memory per sample of the window, in each step
 BETAS = 0.9, 0.99  # of Adam
 # Adam's first step on parameters that are no logarithms: a deep kernel's weights
 NETWORK_RATE = 0.015
@@ -29,8 +29,8 @@ NETWORK_RATE = 0.015
 # features of noise do not stay (decoupled as in Loshchilov & Hutter, ICLR 2019)
 NETWORK_DECAY = 0.25
 LEAST, LEAST_NOISE, MOST = -7.0, -14.0, 7.0  # of logarithms: far beyond what standardised data can mean
-#: of its samples after which the parts of a step end; the first only makes the caches follow the last step
-PARTS = 0.0, 0.75, 1.0
+#: of its samples after which the parts of a step end; the first is one of its own where caches are made, too
+PARTS = 0.1, 0.6, 1.0
 _SHORT = 8  # samples between two rebuilds from which on a step leaves the last one out
 
 
@@ -134,7 +134,7 @@ class LearnHyperparameters(Part):
     state and k samples. The streaming variational bound needs as much and is a worse objective: it inflates
     the noise.
 
-    With a memory, each step predicts 2 k samples of the past too, others in each, so that a network with
+    With a memory, each step predicts 4 k samples of the past too, others in each, so that a network with
     thousands of weights does not run after the last k. The state has seen them; each is left out of it in
     closed form.
 
@@ -195,7 +195,7 @@ class LearnHyperparameters(Part):
             self.descend(learner)
         elif learner.engine is not None and self.lead and self.memory:
             for ahead, end in enumerate(PARTS[-2::-1], 1):  # a large step in parts
-                if (end or self._leads) and self._is_due(learner, n + ahead):
+                if (ahead == 1 or self._leads) and self._is_due(learner, n + ahead):
                     learner.engine.descend(learner, self, n + ahead, end)
         if self._leads and learner.is_due(n):
             for ahead, p in self.pairs(learner):
