@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -249,6 +250,14 @@ def covariance_problems(name: str, P: torch.Tensor, largest: torch.Tensor | None
     if largest is not None and bool((variance > (1 + 1e-6) * largest).any()):
         return [f"{name}: less is known than at the start"]
     return []
+
+
+def precision_problems(name: str, A: torch.Tensor) -> list[str]:
+    """The same of matrices of information ``(*batch, n, n)``, which may be singular, to rounding."""
+    rounding = math.sqrt(torch.finfo(A.dtype).eps) * float(A.abs().amax())
+    symmetric = bool(((A - A.mT).abs() <= rounding).all())
+    known = symmetric and bool((torch.linalg.eigvalsh(A.double())[..., 0] >= -rounding).all())
+    return [] if known else [f"{name} is negative in some direction, or not symmetric"]
 
 
 def bound_problems(state: Mapping[str, Any], **bounds: tuple[float, float]) -> list[str]:

@@ -194,29 +194,33 @@ def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     assert torch.equal(learner(x), mean)
 
 
+FULL = torch.full_like
+
+
 @pytest.mark.parametrize(
-    ("entry", "value"), [("slot", 10**12), ("count", 9), ("count", 1), ("slot", 7), ("active", 1.0)]
-)
-def test_counts_that_lead_out_of_the_memory_are_refused(entry: str, value: float) -> None:
-    """Compiled loops write where they lead."""
+    ("name", "ends", "hostile", "said"),
+    [
+        # compiled loops write where counts lead
+        *(("sogp", f"posterior.{entry}", lambda t, n=n: FULL(t, n), "posterior") for entry, n in (
+            ("slot", 10**12), ("count", 9), ("count", 1), ("slot", 7), ("active", 1.0)
+        )),
+        # what is stated would be NaN, or turned round
+        *(("mixture", "output.scale", lambda t, n=n: FULL(t, n), "not above 0") for n in (0.0, -1.0)),
+        # factors of these matrices would be NaN
+        *((name, end, torch.neg, "in some direction") for name, end in (
+            ("sogp", "posterior.moments"), ("mixture", "1.information")
+        )),
+    ],
+)  # fmt: skip
+def test_a_state_to_which_no_stream_leads_is_refused(name, ends, hostile, said) -> None:
     x, y = stream()
-    learner, other = sogp(), sogp()
+    learner, other = LEARNERS[name](), LEARNERS[name]()
     other.update(x[:4], y[:4])
     state = other.state_dict()
-    state[f"posterior.{entry}"] = torch.full_like(state[f"posterior.{entry}"], value)
-    with pytest.raises(exceptions.StateMismatchError, match="posterior"):
-        learner.load_state_dict(state)
+    for entry in [key for key in state if key.endswith(ends)]:
+        with pytest.raises(exceptions.StateMismatchError, match=said):
+            learner.load_state_dict({**state, entry: hostile(state[entry])})
     assert not learner(x).any()
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0])
-def test_a_scale_that_is_none_is_refused(value: float) -> None:
-    """What is stated would be NaN, or turned round."""
-    learner = RecursiveLeastSquares(3, 2)
-    state = dict(learner.state_dict())
-    state["units.output.scale"] = torch.full((2,), value, dtype=torch.float64)
-    with pytest.raises(exceptions.StateMismatchError, match="scale is not above 0"):
-        learner.load_state_dict(state)
 
 
 def test_flipped_bits_and_cuts_of_a_file(tmp_path: Path) -> None:

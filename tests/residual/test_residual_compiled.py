@@ -52,7 +52,7 @@ def all_parts() -> list:
 OPTIONS = {
     "plain": lambda shape: {},
     "matern32": lambda shape: {"kernel": Matern32(D, lengthscale=[1.0, 2.0, 3.0, 4.0], batch_shape=shape)},
-    "shared kernel": lambda shape: {"kernel": Matern32(D, variance=2.0)},
+    "one kernel": lambda shape: {"kernel": Matern32(D, variance=2.0)},
     "action": lambda shape: {
         "kernel": ActionLinearKernel(D, 2, state_kernel=Matern32(2, batch_shape=shape), batch_shape=shape),
         "parts": [Standardize(), RobustWeight(3.0)],

@@ -154,13 +154,14 @@ def test_units_of_a_model_with_masks_are_those_of_its_own_samples():
         torch.testing.assert_close(units.output.scale[i, j], own_y.square().mean(0).sqrt(), atol=0, rtol=0.1)
 
 
-def test_one_kernel_for_a_fleet_as_large_as_the_inputs_are_wide():
+def test_each_model_of_a_fleet_gets_a_kernel_of_its_own():
+    """The fleet is as large as the inputs are wide."""
     x, y = stream(64, 3)
     kernel, parts = SquaredExponential(3), [LearnHyperparameters()]
     gp = sogp(3, 2, capacity=8, batch_shape=(3,), kernel=kernel, parts=parts)
-    start = gp.kernel.log_lengthscale.clone()
     gp.update(x, y, torch.tensor([True, False, False]).expand(64, 3))
-    assert bool((gp.kernel.log_lengthscale != start).all())
+    moved = gp.kernel.log_lengthscale != kernel.log_lengthscale
+    assert moved.all(-1).tolist() == moved.any(-1).tolist() == [True, False, False]
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -272,6 +273,7 @@ def test_masks_may_be_lists_of_bools_only():
         (lambda: default_learner(-1, 2), "in_features = -1"),
         (lambda: sogp(0, 2), "in_features"),
         (lambda: ActionLinearKernel(3, 3), "action_features"),
+        (lambda: ActionLinearKernel(3, 1, state_kernel=SquaredExponential(2, batch_shape=(3,))), "kernel"),
         (lambda: SquaredExponential(3, lengthscale=[1.0, 2.0]), "lengthscale"),
         (lambda: RecursiveLeastSquares(1, 1, forgetting_factor="0.9"), "factor"),
         *((lambda bad=bad: ForgettingFactor(bad), "factor") for bad in (None, 0.0, 1.1)),

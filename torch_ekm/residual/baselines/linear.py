@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import nn
 
 from ..._checks import check_count, check_fraction, check_positive
+from ..._recorded import precision_problems
 from ...typing import Bool, Float, Tensor
 from ..base import joint_draws
 from ..kernels.kernel import log_parameter
@@ -61,6 +63,10 @@ class LinearInFeatures(ScaledLearner):
         self.covariance = nn.Buffer(prior.expand(*self.batch_shape, f, f).clone())
         self.weights = nn.Buffer(zeros(*self.batch_shape, f, self.out_features))
         self.pending = nn.Buffer(zeros(self.batch_shape))
+
+    def state_problems(self, state: Mapping[str, Any]) -> list[str]:
+        """What is wrong with the matrices of a state that is to be loaded."""
+        return precision_problems("information", state["information"])
 
     @abstractmethod
     def features(self, x: Float[Tensor, "*any in"]) -> Float[Tensor, "*any f"]:

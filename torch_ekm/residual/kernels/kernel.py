@@ -8,6 +8,7 @@ optimiser would leave its caches stale).
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, cast
@@ -115,7 +116,7 @@ def log_parameter(
 
 
 def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...]) -> Kernel:
-    """The kernel, if it takes inputs of that width and is one for all models or one for each.
+    """The kernel, if it takes inputs of that width; of one for a single model each of a fleet gets a copy.
 
     Raises:
         ParameterError: it is none, or of another width or fleet.
@@ -125,10 +126,14 @@ def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...])
         valid += f", for one model or a fleet of {tuple(batch_shape)}"
     check_kind("kernel", kernel, Kernel, valid)
     try:
+        if batch_shape and _shape_of(kernel, in_features) == ():
+            kernel = copy.deepcopy(kernel)
+            for one in kernel.hyperparameters().values():
+                one.data = one.expand(*batch_shape, *one.shape).contiguous()
         shape = _shape_of(kernel, in_features)
     except RuntimeError:
         raise ParameterError("kernel", repr(kernel), valid) from None
-    if shape not in ((), tuple(batch_shape)):
+    if shape != tuple(batch_shape):
         raise ParameterError("kernel", repr(kernel), valid)
     return kernel
 
@@ -141,11 +146,6 @@ def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """
     check_counts("batch_shape", options.get("batch_shape", ()))
     return {name: options[name] for name in ("batch_shape", "device") if name in options}
-
-
-def is_shared(kernel: Kernel, in_features: int) -> bool:
-    """Whether the kernel is one for all models of a fleet."""
-    return _shape_of(kernel, in_features) == ()
 
 
 def _shape_of(kernel: Kernel, in_features: int) -> tuple[int, ...]:

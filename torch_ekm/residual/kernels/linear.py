@@ -9,7 +9,7 @@ import torch
 from ..._checks import check_count
 from ...exceptions import ParameterError
 from ...typing import Float, Tensor
-from .kernel import Kernel, log_parameter
+from .kernel import Kernel, check_kernel, log_parameter
 from .stationary import SquaredExponential
 
 
@@ -91,7 +91,7 @@ class ActionLinearKernel(Kernel):
         action_variance: diagonal of Lambda, one number or one per action.
 
     Raises:
-        ParameterError: no column is left for the state.
+        ParameterError: no column is left for the state, or its kernel is of another width or fleet.
     """
 
     starts = ("action_variance",)
@@ -115,7 +115,7 @@ class ActionLinearKernel(Kernel):
         factory = {"dtype": dtype, "device": device}
         if state_kernel is None:
             state_kernel = SquaredExponential(self.state_features, batch_shape=batch_shape, **factory)
-        self.state_kernel = state_kernel
+        self.state_kernel = check_kernel(state_kernel, self.state_features, batch_shape)
         shape = *batch_shape, self.action_features
         self.log_action_variance = log_parameter("action_variance", action_variance, shape, **factory)
 

@@ -13,7 +13,7 @@ from ..._checks import check_count, check_positive
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..adam import Adam
-from ..kernels.kernel import Kernel, is_shared
+from ..kernels.kernel import Kernel
 from ..recent import Recent
 from .forgetting import ForgettingFactor, ProcessNoise
 from .monitor import RobustWeight
@@ -172,7 +172,6 @@ class LearnHyperparameters(Part):
         posterior, like = learner.posterior, learner.posterior.basis
         fleet, self.window = posterior.batch_shape, learner.refresh_every
         self.lead = int(self.window >= _SHORT)
-        self.shared_kernel = is_shared(learner.kernel, like.shape[-1])
         self.n_steps = nn.Buffer(like.new_zeros(fleet))
         self.loss = PrequentialLoss(posterior, factor, None if weight is None else weight.threshold)
         # where steps lead to; kernel and noise follow at the next rebuild: until then the caches are theirs
@@ -297,11 +296,11 @@ class LearnHyperparameters(Part):
         for i, ((name, p), gradient) in enumerate(zip(self.ahead().items(), gradients, strict=True)):
             if gradient is None:
                 continue
-            shared, logarithm = self.shared_kernel and name != "log_noise", is_logarithm(name)
-            good = gradient.isfinite() & (_spread(on, p, shared) > 0)
+            logarithm = is_logarithm(name)
+            good = gradient.isfinite() & (_spread(on, p) > 0)
             if not logarithm:
-                p.sub_(_spread(decay, p, shared) * p)
-            step = (self.rate if logarithm else NETWORK_RATE) * _spread(correction, p, shared)
+                p.sub_(_spread(decay, p) * p)
+            step = (self.rate if logarithm else NETWORK_RATE) * _spread(correction, p)
             self.adam.move(i, p, gradient.where(good, 0.0), step, good)
             if logarithm:
                 p.clamp_(LEAST_NOISE if name == "log_noise" else LEAST, MOST)
@@ -317,8 +316,6 @@ def _shrink(n: Tensor) -> Tensor:
     return (1.0 + n / 30.0).rsqrt().clamp_min(0.1)
 
 
-def _spread(value: Float[Tensor, "*batch"], like: Tensor, shared: bool) -> Tensor:
-    """A value per model against a parameter; one shared by the fleet takes the mean."""
-    if shared or like.shape[: value.dim()] != value.shape:
-        return value.mean()
+def _spread(value: Float[Tensor, "*batch"], like: Tensor) -> Tensor:
+    """A value per model against a parameter."""
     return value[(..., *(None,) * (like.dim() - value.dim()))]

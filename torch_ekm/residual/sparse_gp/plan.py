@@ -11,7 +11,6 @@ from __future__ import annotations
     VALUES,  # width of the input and all layers of a network
     KIND,  # of the kernel, see engine.numba_kernels
     ACTIONS,  # last columns in which the kernel is linear
-    OWN,  # 1: each model has its own kernel; 0: all share one
     FIGURES,  # novelty threshold, jitter, square of a robust weight's threshold (0: none)
     BASIS, ACTIVE, COUNT, SLOT, MOMENTS, VECTORS, PENDING, LARGEST, LOG_NOISE,
     LOG_LENGTHSCALE, LOG_VARIANCE, LOG_ACTION, SHIFT, SCALE, SHIFT_Y, SCALE_Y, REACH,
@@ -31,7 +30,7 @@ from __future__ import annotations
     SUMS,  # of the queries of a step so far
     RATES,  # of a step, square of a robust weight's threshold (0: none), factor of forgetting
     FIELDS,
-) = range(48)  # fmt: skip
+) = range(47)  # fmt: skip
 #: of a mixture behind these, of which it has MODELS, IN, OUT and LARGEST
 (
     N_EXPERTS, N_SHARES, N_TAILS,

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from ..._recorded import precision_problems
 from ...exceptions import ParameterError
 from ...typing import Bool, Float, Tensor
 from ..kernels.kernel import Kernel
@@ -82,7 +83,7 @@ class SparsePosterior(nn.Module):
         taken = active.gather(-1, slot.unsqueeze(-1)).squeeze(-1)
         if bool(((active != 0) & (active != 1)).any() | (active.sum(-1) != count).any() | (taken != 0).any()):
             return ["active: not as many points as count says, or one where slot is"]
-        return []
+        return precision_problems("moments[2]", state["moments"][..., 2, :, :])
 
     def reset(self) -> None:
         """Back to the prior, without a basis vector."""

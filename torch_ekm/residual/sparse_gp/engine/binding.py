@@ -174,22 +174,22 @@ class Plan(Bound):
             P.VECTORS: past.vectors, P.LOG_NOISE: learning.log_noise, P.N_STEPS: learning.n_steps,
             P.RATES: self.own(figures),
         })  # fmt: skip
-        d, own = gp.in_features, len(self.all) if row[P.OWN] else 1
+        d, models = gp.in_features, len(self.all)
         states = row[[P.LOG_LENGTHSCALE, P.LOG_ACTION, P.LOG_VARIANCE]].tolist()
         places, at, rows = dict(zip(states, (0, d - int(row[P.ACTIONS]), d), strict=True)), d + 1, []
         if isinstance(learning.kernel, DeepKernel):
             pairs = zip_longest(learning.kernel.weights, learning.kernel.biases)
             for p in filter(lambda p: p is not None, chain.from_iterable(pairs)):
-                places[p.data_ptr()], at = at, at + p.numel() // own
+                places[p.data_ptr()], at = at, at + p.numel() // models
         places[learning.log_noise.data_ptr()] = at
         for i, (name, p) in enumerate(learning.ahead().items()):
-            size, noise = p.numel() // (len(self.all) if name == "log_noise" else own), name == "log_noise"
+            size, noise = p.numel() // models, name == "log_noise"
             moments = (learning.adam.get_buffer(f"{order}_{i}").data_ptr() for order in ("first", "second"))
             rows.append([p.data_ptr(), *moments, size, places[p.data_ptr()], is_logarithm(name) + noise])
         M, m, n = row[P.SLOTS], gp.out_features, at + gp.out_features
         row[P.LEARNING] = self.own(np.array([learning.window, learning.replayed(), len(rows), n]))
         row[P.PARAMETERS] = self.own(np.array(rows))
-        row[P.SUMS] = self.own(np.empty((len(self.all), M * (2 * M + m + row[P.WIDTH]) + n + 3)))
+        row[P.SUMS] = self.own(np.empty((models, M * (2 * M + m + row[P.WIDTH]) + n + 3)))
         return row
 
     def is_rough(self, gp: Host) -> bool:
@@ -233,35 +233,21 @@ def _reason(gp: Host, tensors: list[Tensor]) -> str:
         return f"they compute in float64, and its dtype is {gp.dtype}"
     if not all(t.is_cpu and t.is_contiguous() for t in tensors):
         return "a buffer of it is not contiguous, or not on the CPU"
-    if len(_fleet_axes(gp.kernel)) > 1:
-        return "a part of its kernel is one for all models, and a part is not"
     # these have no version
     return "it was made in inference mode" if any(t.is_inference() for t in tensors) else ""
-
-
-def _fleet_axes(kernel: Kernel) -> set[int]:
-    """Numbers of axes that its parameters have in front of their own."""
-    own = {"log_variance": 0, "weights": 2}
-    names = ((name.split("."), p) for name, p in kernel.hyperparameters().items())
-    return {p.dim() - own.get(name[-1] if "log" in name[-1] else name[0], 1) for name, p in names}
 
 
 def _known(kernel: Kernel) -> dict[int, Any] | None:
     """Fields of a kernel that the loops know; None: they do not. A subclass may compute something else."""
     if type(kernel) is LinearKernel:  # action-linear without a state
-        slopes = kernel.log_slope_variance
-        return {
-            P.KIND: 0, P.ACTIONS: slopes.shape[-1], P.OWN: int(kernel.log_variance.dim() > 0),
-            P.LOG_ACTION: slopes, P.LOG_VARIANCE: kernel.log_variance,
-        }  # fmt: skip
+        slopes, log_variance = kernel.log_slope_variance, kernel.log_variance
+        return {P.KIND: 0, P.ACTIONS: slopes.shape[-1], P.LOG_ACTION: slopes, P.LOG_VARIANCE: log_variance}
     inner = {ActionLinearKernel: "state_kernel", DeepKernel: "base"}.get(type(kernel))
     state: Any = kernel if inner is None else getattr(kernel, inner)
     if type(state) not in _KINDS:
         return None
-    fields = {
-        P.KIND: _KINDS[type(state)], P.OWN: int(state.log_variance.dim() > 0),
-        P.LOG_LENGTHSCALE: state.log_lengthscale, P.LOG_VARIANCE: state.log_variance,
-    }  # fmt: skip
+    own = {P.LOG_LENGTHSCALE: state.log_lengthscale, P.LOG_VARIANCE: state.log_variance}
+    fields = {P.KIND: _KINDS[type(state)], **own}
     if isinstance(kernel, ActionLinearKernel):
         fields |= {P.ACTIONS: kernel.action_features, P.LOG_ACTION: kernel.log_action_variance}
     return fields

@@ -15,7 +15,6 @@ from ....exceptions import SpeedWarning
 from ....typing import Tensor
 from ...report import MomentsWithJacobians, UpdateReport
 from ...running_scale import SETTLED, RunningScale
-from .. import plan as P
 from ..hyperparameters import PARTS, LearnHyperparameters
 from ..part import Host
 from .binding import Bound, Engine, Plan
@@ -86,8 +85,7 @@ class CompiledEngine(Engine):
         Its parts are the same, and so is their sum, whenever they come.
         """
         plan = self._free(gp)
-        # the gradient of one kernel for all models is a sum
-        if plan is None or not (plan.row[P.OWN] or len(plan.all) == 1):
+        if plan is None:
             return False
         loops, step = load_loops(), (n, learning.since)
         begin = plan.begun[1]

@@ -25,11 +25,11 @@ def embed_fleet(p):
     d, M = p[P.IN], p[P.SLOTS]
     for b in range(p[P.MODELS]):
         basis, values = matrix_at(p[P.BASIS], b, M, d), matrix_at(p[P.LAYERED], b, M, p[P.VALUES])
-        turn_weights(p, b * p[P.OWN])
+        turn_weights(p, b)
         for i in range(M):
             for j in range(d):
                 values[i, j] = basis[i, j]
-        embed(p, b * p[P.OWN], values, matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH]))
+        embed(p, b, values, matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH]))
 
 
 @inner(F(I1, INT, A1, A1, A1, A1, A1, A1))
@@ -38,14 +38,14 @@ def look(p, b, x, values, q, k, psi, phi):
 
     ``values`` begins with z, x in the learner's units; ``q`` is z as the kernel sees it.
     """
-    d, M, own = p[P.IN], p[P.SLOTS], b * p[P.OWN]
+    d, M = p[P.IN], p[P.SLOTS]
     shift, scale = vector_at(p[P.SHIFT], b, d), vector_at(p[P.SCALE], b, d)
     reach = vector_at(p[P.REACH], 0, d)
     for j in range(d):
         values[j] = min(max((x[j] - shift[j]) / scale[j], -reach[j]), reach[j])
-    embed(p, own, values.reshape(1, values.shape[0]), q.reshape(1, q.shape[0]))
+    embed(p, b, values.reshape(1, values.shape[0]), q.reshape(1, q.shape[0]))
     basis = matrix_at(p[P.EMBEDDED], b, M, p[P.WIDTH])
-    return kernel_row(p, own, q, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi)
+    return kernel_row(p, b, q, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi)
 
 
 @inner(F(I1, INT, F, A1, A1, A1))
@@ -116,7 +116,7 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
     left, slopes, by = np.empty((M, rows)), np.empty((rows, W)), np.empty((rows, W - d))
     reach = vector_at(p[P.REACH], 0, d)
     for b in range(p[P.MODELS]):
-        own, mean_ = b * p[P.OWN], vector_at(mean, b, m)
+        mean_ = vector_at(mean, b, m)
         prior = look(p, b, vector_at(x, b, d), values, q, k, psi, phi)
         v = mean_and_variance(p, b, prior, k, Ck, mean_)
         cut(p, b, mean_, inside)
@@ -133,13 +133,13 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
                 left[i, o] = alpha[i, o]
             for o in range(m, rows):
                 left[i, o] = 2.0 * Ck[i]
-        kernel_slopes(p, own, q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, left, slopes)
-        log_variance = vector_at(p[P.LOG_VARIANCE], own, 1)[0]
-        log_action = vector_at(p[P.LOG_ACTION], own, n_a)
+        kernel_slopes(p, b, q, matrix_at(p[P.EMBEDDED], b, M, W), psi, phi, left, slopes)
+        log_variance = vector_at(p[P.LOG_VARIANCE], b, 1)[0]
+        log_action = vector_at(p[P.LOG_ACTION], b, n_a)
         for o in range(m, rows):  # k(x, x) of an action-linear kernel
             for j in range(n_a):
                 slopes[o, d - n_a + j] += 2.0 * q[d - n_a + j] * math.exp(log_variance + log_action[j])
-        log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], own, d - n_a)
+        log_lengthscale = vector_at(p[P.LOG_LENGTHSCALE], b, d - n_a)
         for j in range(d - n_a):
             by_q = exp(-log_lengthscale[j])
             for r in range(rows):
@@ -148,7 +148,7 @@ def query_fleet(p, noisy, x, mean, variance, J, dv):
             for r in range(rows):
                 for j in range(W - d):
                     by[r, j] = slopes[r, d + j]
-            network_back(p, own, values.reshape(1, values.shape[0]), by, slopes, np.empty(0))
+            network_back(p, b, values.reshape(1, values.shape[0]), by, slopes, np.empty(0))
         for j in range(d):
             by_x = 1.0 / scale[j] if abs(values[j]) < reach[j] else 0.0
             for o in range(m):

@@ -145,10 +145,10 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
         back: derivatives by the basis points, which other points add to.
         of_basis: whether the points are these: a pair of them counts for both.
     """
-    N, M, W, n_a, own = k.shape[0], p[P.SLOTS], p[P.WIDTH], p[P.ACTIONS], b * p[P.OWN]
+    N, M, W, n_a = k.shape[0], p[P.SLOTS], p[P.WIDTH], p[P.ACTIONS]
     d, n_s, gradient = p[P.IN], p[P.IN] - n_a, _sums(p, b)[4]
-    log_action = vector_at(p[P.LOG_ACTION], own, n_a)
-    variance = math.exp(vector_at(p[P.LOG_VARIANCE], own, 1)[0])
+    log_action = vector_at(p[P.LOG_ACTION], b, n_a)
+    variance = math.exp(vector_at(p[P.LOG_VARIANCE], b, 1)[0])
     for i in range(N):
         gradient[d] += by_diagonal[i] * diagonal[i] + dot(by[i], k[i], M)
     for j in range(n_a):
@@ -198,7 +198,7 @@ def _pull_back(p, b, by, by_diagonal, k, diagonal, psi, phi, values, q, basis, b
         for i in range(N):
             for j in range(W - d):
                 features[i, j] = pulled[i, d + j]
-        network_back(p, own, values, features, np.empty((0, 0)), gradient)
+        network_back(p, b, values, features, np.empty((0, 0)), gradient)
 
 
 @njit(types.void(I1, INT, INT, INT, F, F), **COMMON)
@@ -216,7 +216,7 @@ def gather_fleet(p, n, n_rebuilt, n_taken, begin, end):
             by_K[:, :] = less[:, :] = by_alpha[:, :] = back[:, :] = 0.0
             gradient[:] = rest[:] = 0.0
         found = _draw(p, b, n, n_rebuilt, n_taken, x, y_, about_)
-        first, last, own = int(begin * found), int(end * found), b * p[P.OWN]
+        first, last = int(begin * found), int(end * found)
         y, about, N = y_[first:last], about_[first:last], last - first
         active, basis = vector_at(p[P.ACTIVE], b, M), matrix_at(p[P.EMBEDDED], b, M, W)
         moments, alpha = stack_at(p[P.MOMENTS], b, 3, M, M), matrix_at(p[P.VECTORS], 2 * b, M, m)
@@ -224,9 +224,9 @@ def gather_fleet(p, n, n_rebuilt, n_taken, begin, end):
         for i in range(N):
             for j in range(d):
                 values[i, j] = x[first + i, j]
-        embed(p, own, values, q)
+        embed(p, b, values, q)
         k, psi, phi, diagonal = np.empty((N, M)), np.empty((N, M)), np.empty((N, M)), np.empty(N)
-        kernel_rows(p, own, q, basis, active, k, psi, phi, diagonal)
+        kernel_rows(p, b, q, basis, active, k, psi, phi, diagonal)
         E, F_, mean = np.zeros((N, M)), np.zeros((N, M)), np.zeros((N, m))
         add_products(k, moments[0], 1.0, E, False, False)
         add_products(k, moments[1], 1.0, F_, False, False)
@@ -295,9 +295,9 @@ def step_fleet(p):
         by_K, less, T, back, gradient, rest = _sums(p, b)
         if rest[2] == 0.0:
             continue
-        own, alpha = b * p[P.OWN], matrix_at(p[P.VECTORS], 2 * b, M, m)
+        alpha = matrix_at(p[P.VECTORS], 2 * b, M, m)
         basis, values = matrix_at(p[P.EMBEDDED], b, M, W), matrix_at(p[P.LAYERED], b, M, p[P.VALUES])
-        kernel_rows(p, own, basis, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi, diagonal)
+        kernel_rows(p, b, basis, basis, vector_at(p[P.ACTIVE], b, M), k, psi, phi, diagonal)
         by, by_diagonal, by_s2 = np.zeros((M, M)), np.empty(M), rest[0]
         for i in range(M):
             for j in range(i + 1):

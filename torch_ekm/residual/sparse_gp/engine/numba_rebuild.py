@@ -77,7 +77,7 @@ def _gram(p, b, embedded, active):
     """K between the points in use, embedded, with the jitter; 1 on the diagonal of free slots."""
     M, jitter = active.shape[0], 1.0 + vector_at(p[P.FIGURES], 0, 3)[1]
     K, psi, phi, diagonal = np.empty((M, M)), np.empty((M, M)), np.empty((M, M)), np.empty(M)
-    kernel_rows(p, b * p[P.OWN], embedded, embedded, active, K, psi, phi, diagonal)
+    kernel_rows(p, b, embedded, embedded, active, K, psi, phi, diagonal)
     for i in range(M):
         for j in range(M):
             K[i, j] *= active[i]
