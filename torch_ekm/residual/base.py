@@ -295,9 +295,9 @@ class ResidualLearner(Recorded, nn.Module, ABC):
     def bounded_slope(
         self, mean: Float[Tensor, "*all out"], slope: Float[Tensor, "*all out in"]
     ) -> tuple[Float[Tensor, "*all out"], Float[Tensor, "*all out in"]]:
-        """The same with its derivative, which is 0 where the mean is cut."""
+        """The same with its derivative, which is 0 where the mean is cut, and NaN where that is."""
         cut = self.bounded(mean)
-        return cut, slope * (cut == mean).unsqueeze(-1)
+        return cut, slope * torch.where(mean.isnan(), mean, cut == mean).unsqueeze(-1)
 
     # -- state ----------------------------------------------------------------------------------
 

@@ -249,7 +249,7 @@ class MixtureResidual(ResidualLearner):
         x = self.check_query(x)
         means, slopes = map(finite, self._stacked(learner.linearize(x) for learner in self.members))
         mean, slope = self.bounded_slope(self._sum(means), (self.gain.unsqueeze(-2) * slopes).sum(-1))
-        return _only_of(x, mean), slope
+        return _only_of(x, mean), _only_of(x, slope)
 
     def slope_deviation(self, x: Tensor) -> Tensor:
         """``var = sum_e p_e (h_e^2 var_b + (h_e J_b - J)^2)``, within the experts' slopes and between."""
@@ -290,7 +290,7 @@ class MixtureResidual(ResidualLearner):
         return MomentsWithJacobians(
             _only_of(x, mean),
             torch.minimum(variance, most),
-            jacobian,
+            _only_of(x, jacobian),
             torch.where((variance <= most).unsqueeze(-1), slope, steepest),
         )
 
@@ -451,9 +451,10 @@ def _same_shapes(members: list[ResidualLearner]) -> ResidualLearner:
     return members[0]
 
 
-def _only_of(x: Tensor, mean: Tensor) -> Tensor:
-    """A mean, NaN where an input is: there no learner is finite, and the model alone is no answer."""
-    return mean.where(~x.isnan().any(-1, keepdim=True), torch.nan)
+def _only_of(x: Tensor, told: Tensor) -> Tensor:
+    """Means or slopes, NaN where an input is: no learner is finite, and the model alone is no answer."""
+    lost = x.isnan().any(-1)
+    return told.where(~lost.reshape(*lost.shape, *(1,) * (told.dim() - lost.dim())), torch.nan)
 
 
 def finite(values: Tensor) -> Tensor:

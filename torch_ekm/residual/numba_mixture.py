@@ -154,6 +154,10 @@ def mix_fleet(g, members, means_of, latent_of, J_of, dv_of, mean, variance, stan
             free, most = mean_of(g, r, means[o]), FARTHEST_MEAN * vector_at(g[P.LARGEST], r, 1)[0]
             value = min(max(free, -most), most)
             vector_at(mean, r, 1)[0] = value if known else math.nan
+            if not known:  # the query is not finite
+                for at, size in ((variance, 1), (standard, 1), (J, d), (dv, d)):
+                    vector_at(at, r, size if at else 0)[:] = math.nan
+                continue
             gain = vector_at(g[P.GAIN], r, n)
             if J:
                 to = vector_at(J, r, d)
