@@ -71,6 +71,8 @@ def plain(value: Any) -> Any:
         return value
     if isinstance(value, Recorded):
         return describe(value)
+    if isinstance(value, np.generic):
+        return plain(value.item())
     if isinstance(value, list | tuple):
         return [plain(one) for one in value]
     if isinstance(value, torch.Tensor | np.ndarray):

@@ -53,6 +53,14 @@ LEARNERS = {
 }
 
 
+def test_a_fleet_of_which_not_all_had_a_sample_comes_back(tmp_path: Path) -> None:
+    x = torch.rand(2, 3, dtype=torch.float64)
+    fleet = SparseOnlineGP(3, 1, batch_shape=(2,))
+    fleet.update(x, x[:, :1], torch.tensor([True, False]))
+    torch_ekm.save(fleet, tmp_path / "fleet")
+    assert torch.equal(torch_ekm.load(tmp_path / "fleet")(x), fleet(x))
+
+
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_file_holds_learner_and_options(name: str, tmp_path: Path) -> None:
     x, y = stream()

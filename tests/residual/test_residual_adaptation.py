@@ -231,6 +231,24 @@ def test_a_kernel_without_hyperparameters_learns_the_noise_alone():
     torch.testing.assert_close(gp.linearize(x[0])[1], torch.autograd.functional.jacobian(gp, x[0]))
 
 
+class OfNoUse(SquaredExponential):
+    """Its period changes nothing."""
+
+    def __init__(self, in_features: int) -> None:
+        super().__init__(in_features)
+        self.period = torch.nn.Buffer(torch.tensor([2.0], dtype=torch.float64))
+
+    def forward(self, x, z):
+        return super().forward(x, z) + 0.0 * self.period.sum()
+
+
+def test_what_is_neither_a_logarithm_nor_a_weight_does_not_decay():
+    gp = SparseOnlineGP(4, 2, kernel=OfNoUse(4), batch_shape=(3,), parts=[LearnHyperparameters()])
+    x, y = system(0, 300)
+    gp.update(x.unsqueeze(1).expand(-1, 3, -1), y.unsqueeze(1).expand(-1, 3, -1))
+    assert gp.kernel.period.tolist() == [[2.0]] * 3
+
+
 def test_deep_kernel_starts_as_the_plain_one_and_does_not_collapse():
     x, y = system(11, 600)
     errors = []

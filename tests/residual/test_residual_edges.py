@@ -160,6 +160,8 @@ def test_each_model_of_a_fleet_gets_a_kernel_of_its_own():
     kernel, parts = SquaredExponential(3), [LearnHyperparameters()]
     gp = sogp(3, 2, capacity=8, batch_shape=(3,), kernel=kernel, parts=parts)
     gp.update(x, y, torch.tensor([True, False, False]).expand(64, 3))
+    sogp(3, 2, kernel=kernel, parts=parts).update(x[:, 0], y[:, 0])  # a single model has its own, too
+    assert torch.equal(kernel.log_lengthscale, SquaredExponential(3).log_lengthscale)
     moved = gp.kernel.log_lengthscale != kernel.log_lengthscale
     assert moved.all(-1).tolist() == moved.any(-1).tolist() == [True, False, False]
 

@@ -1,11 +1,15 @@
 """A learner in threads, in other processes, and on a screen; targets without an axis of their own."""
 
+import copy
 import multiprocessing
+import pickle
 import threading
+import time
 
 import pytest
 import torch
 
+import torch_ekm
 from torch_ekm.residual import (
     LinearKernel,
     MixtureResidual,
@@ -14,6 +18,7 @@ from torch_ekm.residual import (
     SparseOnlineGP,
     default_learner,
 )
+from torch_ekm.residual.sparse_gp.engine import compiled
 
 
 def learned(make, n: int = 40):
@@ -43,6 +48,53 @@ def test_what_another_process_learns_is_not_learned_here(method):
     there = done.get(timeout=300)
     process.join()
     assert learner(x).item() == before != there
+
+
+@pytest.mark.parametrize("do", [copy.deepcopy, pickle.dumps, "load", "save"])
+def test_a_copy_is_of_one_moment(do, tmp_path):
+    """It waits for an update under way."""
+    learner, _ = learned(SparseOnlineGP)
+    calls = {
+        "load": learner.load_state_dict,
+        "save": lambda of: torch_ekm.save(learner, tmp_path / "learner"),
+    }
+    of = learner.state_dict() if do == "load" else learner
+    thread = threading.Thread(target=calls.get(do, do), args=(of,))
+    with learner.lock:
+        thread.start()
+        thread.join(0.1)
+        assert thread.is_alive()
+    thread.join(60)
+    assert not thread.is_alive()
+
+
+def test_two_threads_know_the_same_memory(monkeypatch):
+    """Else a rebuild would miss what a sample has written for the other one."""
+
+    class Slow(compiled.Plan):
+        def __init__(self, gp) -> None:
+            super().__init__(gp)
+            first = gp is learner.members[0]  # one thread is late with it, the other one with the rest
+            time.sleep(0.05 if first is (threading.current_thread() is asking) else 0.0)
+
+    monkeypatch.setattr(compiled, "Plan", Slow)
+    learner, x = default_learner(2, 1), torch.rand(9, 2, dtype=torch.float64)
+    asking = threading.Thread(target=lambda: [learner(row) for row in x])
+    asking.start()
+    learner.update(x, x[:, :1])
+    asking.join()
+    bound = learner._engine._bound
+    assert all(plan is one.engine._plan for plan, one in zip(bound.plans, bound.learners, strict=True))
+
+
+@pytest.mark.parametrize("name", ["gain", "learners.0.posterior.basis"])
+def test_memory_that_torch_has_moved_is_found(name):
+    """As it does with a tensor that is sent to a process."""
+    (moved, x), (other, _) = (learned(lambda d, m: MixtureResidual(SparseOnlineGP(d, m))) for _ in range(2))
+    moved.get_buffer(name).share_memory_()
+    for learner in (moved, other):
+        learner.update(x, -x[:, 1:])
+    assert torch.equal(moved(x), other(x))
 
 
 def test_a_fork_while_another_thread_updates_goes_on():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -398,14 +399,14 @@ def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> N
             its ``learner``) or another library's objects; the message names it.
         OutputError: the file cannot be written.
     """
-    if isinstance(learner, EnhancedModel):
-        described = describe(learner)
-        described["arguments"].pop("model")
-        state = {name: one for name, one in learner.state_dict().items() if not name.startswith("model.")}
-    elif isinstance(learner, ResidualLearner):
-        described, state = describe(learner), learner.state_dict()
-    else:
+    if not isinstance(learner, ResidualLearner | EnhancedModel):
         raise NoStateError(type(learner).__name__, "it is neither a ResidualLearner nor an EnhancedModel")
+    described = describe(learner)
+    with (learner.learner if isinstance(learner, EnhancedModel) else learner).lock:
+        state = copy.deepcopy(learner.state_dict())  # of one moment, whoever learns meanwhile
+    if isinstance(learner, EnhancedModel):
+        described["arguments"].pop("model")
+        state = {name: one for name, one in state.items() if not name.startswith("model.")}
     write(path, described, state)
 
 

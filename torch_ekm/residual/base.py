@@ -312,11 +312,13 @@ class ResidualLearner(Recorded, nn.Module, ABC):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy in another process, too: torch would share a tensor's memory with it."""
-        return processes.unpickled, (type(self), pickle.dumps(self.__getstate__()))
+        with self.lock:
+            return processes.unpickled, (type(self), pickle.dumps(self.__getstate__()))
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ResidualLearner:
         made = memo[id(self)] = type(self).__new__(type(self))
-        made.__setstate__(copy.deepcopy(self.__getstate__(), memo))
+        with self.lock:
+            made.__setstate__(copy.deepcopy(self.__getstate__(), memo))
         return made
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -334,7 +336,8 @@ class ResidualLearner(Recorded, nn.Module, ABC):
         """
         own = {name[len(prefix) :]: value for name, value in state_dict.items() if name.startswith(prefix)}
         check_state(self, own)
-        super()._load_from_state_dict(state_dict, prefix, *args, **options)
+        with self.lock:
+            super()._load_from_state_dict(state_dict, prefix, *args, **options)
 
     # -- checks ---------------------------------------------------------------------------------
 

@@ -35,6 +35,15 @@ class Answer(NamedTuple):
     slope: Tensor  #: of the variance
 
 
+class BoundMixture(Bound):
+    """A mixture's memory, and that of its learners, the last of which is of the noise."""
+
+    def __init__(self, plans: list[Plan], learners: list[Any]) -> None:
+        super().__init__()
+        self.plans, self.learners = plans, learners
+        self.members = np.stack([plan.row for plan in plans])
+
+
 class CompiledMixture(Engine):
     """Updates and queries of one sample per model, on the memory of the mixture and its learners.
 
@@ -42,8 +51,7 @@ class CompiledMixture(Engine):
     """
 
     def __init__(self) -> None:
-        self._bound: Bound | None = None
-        self._plans: list[Plan] = []  # one for each learner
+        self._bound: BoundMixture | None = None
 
     # -- calls ----------------------------------------------------------------------------------
 
@@ -52,7 +60,8 @@ class CompiledMixture(Engine):
         bound = self._takes(g, x)
         if bound is None:
             return None
-        x, one, n = x.contiguous(), (*g.batch_shape, g.out_features), len(self._plans)
+        plans = bound.plans
+        x, one, n = x.contiguous(), (*g.batch_shape, g.out_features), len(plans)
         two = *one, g.in_features
         shapes = zip(Answer._fields, (one, one, one, two, two), strict=True)
         found = Answer(*(x.new_empty(s if name == "mean" or name in wanted else 0) for name, s in shapes))
@@ -62,10 +71,10 @@ class CompiledMixture(Engine):
         told = [x.new_empty(shape) for shape in shapes]  # by each learner
         each, sizes = [t.data_ptr() for t in told], [8 * t.numel() // n for t in told]
         loops = load_loops()
-        for i, plan in enumerate(self._plans if wants[1] else self._plans[:-1]):
+        for i, plan in enumerate(plans if wants[1] else plans[:-1]):
             at = (begin + i * size for begin, size in zip(each, sizes, strict=True))
             loops.query_fleet(plan.row, False, x.data_ptr(), *at)
-        loops.mix_fleet(bound.row, self._members, *each, *addresses)
+        loops.mix_fleet(bound.row, bound.members, *each, *addresses)
         return found
 
     def learn(self, g: Any, x: Tensor, y: Tensor, mask: Tensor | None) -> UpdateReport | None:
@@ -73,14 +82,14 @@ class CompiledMixture(Engine):
         bound = self._takes(g, x)
         if bound is None or not is_plain_one(y, (*g.batch_shape, g.out_features)):
             return None
-        pairs = list(zip(self._plans, self._learners, strict=True))
+        pairs = list(zip(bound.plans, bound.learners, strict=True))
         if any(plan.is_rough(one) for plan, one in pairs):  # what it predicts would be another after that
             return None
         x, y = x.contiguous(), y.contiguous()
         of_all, said = np.empty((4, len(bound.all))), np.empty((2, y.numel()))
-        numbers = np.array([one.n_samples for one in self._learners])
+        numbers = np.array([one.n_samples for one in bound.learners])
         alarm = load_loops().update_mixture(
-            bound.row, self._members, numbers, on_array(bound, mask), x.data_ptr(), y.data_ptr(), said, of_all
+            bound.row, bound.members, numbers, on_array(bound, mask), x.data_ptr(), y.data_ptr(), said, of_all
         )
         if alarm < 0:  # not finite
             return None
@@ -94,24 +103,26 @@ class CompiledMixture(Engine):
 
     # -- what they work on ----------------------------------------------------------------------
 
-    def _takes(self, g: Any, x: Tensor) -> Bound | None:
+    def _takes(self, g: Any, x: Tensor) -> BoundMixture | None:
         """The buffers, where this call is one for compiled loops; binds them."""
         if torch.compiler.is_compiling() or not is_plain_one(x, (*g.batch_shape, g.in_features)):
             return None
         if g.dtype != torch.float64 or load_loops() is None:
             return None
-        if self._bound is None or not self._bound.is_current():
-            self._bound, self._learners = None, [*g.members, g.noise.gp]
-            plans = [plan for plan in map(_plan, self._learners) if plan is not None]
-            if len(plans) < len(self._learners):
-                return None
-            self._bound, self._plans = self._bind(g, plans), plans
-            self._members = np.stack([plan.row for plan in plans])
-        usable = self._bound.usable and all(plan.follows() for plan in self._plans)
-        return self._bound if usable else None
+        bound = self._bound
+        if bound is None or not bound.is_current():
+            with g.lock:  # of two threads one binds, between two updates
+                if self._bound is None or not self._bound.is_current():
+                    learners = [*g.members, g.noise.gp]
+                    plans = [plan for plan in map(_plan, learners) if plan is not None]
+                    self._bound = self._bind(g, plans, learners) if len(plans) == len(learners) else None
+                bound = self._bound
+        if bound is None or not bound.usable:
+            return None
+        return bound if all(plan.follows(g.lock) for plan in bound.plans) else None
 
-    def _bind(self, g: Any, plans: list[Plan]) -> Bound:
-        bound, tails = Bound(), g.tails
+    def _bind(self, g: Any, plans: list[Plan], learners: list[Any]) -> BoundMixture:
+        bound, tails = BoundMixture(plans, learners), g.tails
         at_zero = StudentT(tails.freedoms).log_prob(torch.zeros_like(tails.freedoms))
         fields = {
             P.LARGEST: g.largest, P.EXPERTS: g._experts, P.PRIOR: g.prior, P.EVIDENCE: g.evidence,
@@ -123,7 +134,7 @@ class CompiledMixture(Engine):
             P.NOISE_SHARES: g.noise.shares,
         }  # fmt: skip
         own = g._modules, g.learners._modules, g.noise._modules
-        bound.watch((g, tails, g.noise), *own, others=plans)
+        bound.watch((g, tails, g.noise), *own, moved=fields.values(), others=plans)
         bound.usable = all(
             t.is_cpu and t.is_contiguous() and t.dtype == torch.float64 for t in fields.values()
         )

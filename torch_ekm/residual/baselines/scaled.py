@@ -63,7 +63,8 @@ class ScaledLearner(ResidualLearner):
 
     def _slopes(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """f(z) and df/dz ``(*any, out, in)``; autograd here."""
-        mean, slope = value_and_jacobian(self._mean, z)
+        with self.lock:
+            mean, slope = value_and_jacobian(self._mean, z)
         return mean, z.new_zeros(*mean.shape, z.shape[-1]) if slope is None else slope
 
     def _slope_variance(self, z: Tensor) -> Tensor:

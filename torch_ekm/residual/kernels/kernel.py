@@ -26,7 +26,8 @@ class Kernel(Recorded, nn.Module, ABC):
     """A covariance function k(x, z) of two points, with its derivative by the first.
 
     A kernel of your own implements ``forward``, ``diagonal`` and ``with_gradient``, and ``diagonal_gradient``
-    unless k(x, x) is constant. Its hyperparameters are its buffers.
+    unless k(x, x) is constant. Its hyperparameters are its buffers; one whose name begins with ``log_`` keeps
+    within exp(-7) and exp(7). Those of a fleet have its axes in front.
     """
 
     def hyperparameters(self) -> dict[str, Tensor]:
@@ -67,8 +68,8 @@ class Kernel(Recorded, nn.Module, ABC):
     def derivative_variance(self, x: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch d"]:
         """Prior variance of dg/dx_j, ``d2k(x, z)/dx_j dz_j`` at ``z = x``."""
         with torch.inference_mode(False), torch.enable_grad():
-            z = x.detach().clone().requires_grad_(True)
-            slopes = self.with_gradient(x.detach().clone(), z.unsqueeze(-2))[1].squeeze(-2)
+            z, kept = x.detach().clone().requires_grad_(True), copy.deepcopy(self)  # who learns may move it
+            slopes = kept.with_gradient(x.detach().clone(), z.unsqueeze(-2))[1].squeeze(-2)
             by = [torch.autograd.grad(one.sum(), z, retain_graph=True)[0] for one in slopes.unbind(-1)]
         return torch.stack([one[..., j] for j, one in enumerate(by)], dim=-1)
 
@@ -116,24 +117,25 @@ def log_parameter(
 
 
 def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...]) -> Kernel:
-    """The kernel, if it takes inputs of that width; of one for a single model each of a fleet gets a copy.
+    """A copy of the kernel, if it takes inputs of that width; each model of a fleet has one of its own.
 
     Raises:
-        ParameterError: it is none, or of another width or fleet.
+        ParameterError: it is none, or of another width or fleet, or of several.
     """
     valid = f"a Kernel of {in_features} inputs"
     if batch_shape:
-        valid += f", for one model or a fleet of {tuple(batch_shape)}"
+        valid += f", for one model or, with all its hyperparameters, for a fleet of {tuple(batch_shape)}"
     check_kind("kernel", kernel, Kernel, valid)
+    kernel = copy.deepcopy(kernel)
+    theta, fleet = list(kernel.hyperparameters().values()), tuple(batch_shape)
     try:
-        if batch_shape and _shape_of(kernel, in_features) == ():
-            kernel = copy.deepcopy(kernel)
-            for one in kernel.hyperparameters().values():
-                one.data = one.expand(*batch_shape, *one.shape).contiguous()
-        shape = _shape_of(kernel, in_features)
+        if _shape_of(kernel, in_features) == ():
+            for one in theta:
+                one.data = one.expand((*fleet, *one.shape)).contiguous()
+        shape = _shape_of(kernel, in_features) if theta else fleet
     except RuntimeError:
         raise ParameterError("kernel", repr(kernel), valid) from None
-    if shape != tuple(batch_shape):
+    if shape != fleet or any(one.shape[: len(fleet)] != fleet for one in theta):
         raise ParameterError("kernel", repr(kernel), valid)
     return kernel
 
@@ -150,5 +152,5 @@ def fleet_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 def _shape_of(kernel: Kernel, in_features: int) -> tuple[int, ...]:
     like = next(iter(kernel.hyperparameters().values()), torch.empty(0, dtype=torch.float64))
-    x = like.new_zeros(1, in_features)
+    x = like.new_zeros(2, in_features)
     return tuple(kernel(x, x).shape[:-2])

@@ -298,7 +298,7 @@ class LearnHyperparameters(Part):
                 continue
             logarithm = is_logarithm(name)
             good = gradient.isfinite() & (_spread(on, p) > 0)
-            if not logarithm:
+            if not {"weights", "biases"}.isdisjoint(name.split(".")):  # of a network
                 p.sub_(_spread(decay, p) * p)
             step = (self.rate if logarithm else NETWORK_RATE) * _spread(correction, p)
             self.adam.move(i, p, gradient.where(good, 0.0), step, good)

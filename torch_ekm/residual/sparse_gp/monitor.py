@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import nn
 
@@ -15,6 +13,7 @@ CALIBRATION_RATE = 0.2  # of the logarithm of a factor on the noise
 Z90_SQUARED = 1.6448536269514722**2
 RATE = 1 / 8  #: of the shares of samples that do not fit
 RING_SIZE = 24  # samples of which those since the change are learned again
+NO_SAMPLE = 2.0  # in the place of a level, which is 1 at most
 ALARM, LARGE, _ONSET, COOL = 0.6, 5.0, 0.12, -2.0
 FACTOR_LEAST, FACTOR_MOST = -5.0, 10.0  # logarithms
 DISTRUSTED, DISTRUSTED_MOST = 0.25, 0.6  #: shares of distrusted samples
@@ -145,7 +144,7 @@ class DetectChanges(Part):
         mask = sample.mask
         large = (sample.report.nis > LARGE).to(self.level.dtype)
         self.level.lerp_(large, RATE) if mask is None else self.level.lerp_(large, RATE * mask)
-        level = self.level if mask is None else self.level.where(mask > 0, math.inf)  # inf: no sample
+        level = self.level if mask is None else self.level.where(mask > 0, NO_SAMPLE)
         self.levels.select(0, learner.n_samples % RING_SIZE).copy_(level)
         self.misled.observe(sample.innovation, learner.units.output(sample.y), mask)
         return False
@@ -162,7 +161,7 @@ class DetectChanges(Part):
             self.level.masked_fill_(changed, COOL)
             x, y, levels = *learner.recent.last(n, RING_SIZE)[:2], self.levels.roll(-n, 0)
             later = (levels >= _ONSET).to(torch.int64).flip(0).cumprod(0).flip(0) > 0
-            learner.start_anew(changed, x.movedim(-2, 0), y.movedim(-2, 0), later & levels.isfinite())
+            learner.start_anew(changed, x.movedim(-2, 0), y.movedim(-2, 0), later & (levels < NO_SAMPLE))
 
     def reset(self) -> None:
         """No sample was seen."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
 from itertools import chain, zip_longest
 from operator import is_
 from typing import Any
@@ -111,7 +112,8 @@ class Plan(Bound):
         used = set(map(id, tensors))
         owners = (one for one in gp.modules() if not used.isdisjoint(map(id, one.buffers(recurse=False))))
         own = *owners, *(one for one in gp.kernel.modules() if one._parameters)
-        self.watch(own, gp._modules, moved=(*self.parameters, gp.log_noise_variance))
+        handed_out = gp.posterior.buffers()  # whoever sends one to a process has torch move its memory
+        self.watch(own, gp._modules, moved=(*self.parameters, gp.log_noise_variance, *handed_out))
         self.reason = _reason(gp, tensors)
         self.usable = not self.reason
         if not self.usable:
@@ -206,18 +208,22 @@ class Plan(Bound):
             self.learning.act(gp)
         gp.count_sample()
 
-    def follows(self) -> bool:
+    def follows(self, lock: AbstractContextManager) -> bool:
         """Embed the basis again where torch changed it, or the kernel: loops leave no mark on a tensor.
 
-        False: a gradient is to be carried, which loops cannot.
+        ``lock``: of whoever learns. False: a gradient is to be carried, which loops cannot.
         """
         if torch.is_grad_enabled() and any(p.requires_grad for p in self.parameters):
             return False
-        marks = [t._version for t in (self._basis, *self.parameters)]
-        if marks != self._marks:
-            load_loops().embed_fleet(self.row)
-            self._marks = marks
+        if self._found() != self._marks:
+            with lock:
+                marks = self._found()
+                load_loops().embed_fleet(self.row)
+                self._marks = marks
         return True
+
+    def _found(self) -> list[int]:
+        return [t._version for t in (self._basis, *self.parameters)]
 
 
 def _reason(gp: Host, tensors: list[Tensor]) -> str:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.utils._python_dispatch import is_in_torch_dispatch_mode
 
 from ...._arrays import is_plain
 from ...._warnings import warn
@@ -141,13 +140,16 @@ class CompiledEngine(Engine):
         if plan is None or not plan.is_current():
             if load_loops() is None:
                 return None
-            plan = self._plan = Plan(gp)
+            with gp.lock:  # of two threads one binds, between two updates
+                if self._plan is None or not self._plan.is_current():
+                    self._plan = Plan(gp)
+                plan = self._plan
         if not plan.usable:
             if not self._told and gp.device.type == "cpu":
                 self._told = True
                 warn(_LEFT.format(type(gp).__name__, plan.reason), SpeedWarning)
             return None
-        return plan if plan.follows() else None
+        return plan if plan.follows(gp.lock) else None
 
 
 def _settled(scale: RunningScale) -> tuple[Tensor, Tensor] | None:
@@ -164,8 +166,8 @@ def is_plain_one(x: Any, shape: tuple[int, ...]) -> bool:
     """Whether x is an ordinary tensor of that shape, of which torch keeps no record."""
     if not is_plain(x) or x.shape != shape:
         return False
-    # operations of torch are being recorded: torch has no public way to ask
-    return not is_in_torch_dispatch_mode() and not torch.jit.is_tracing()
+    # operations of torch are being recorded, in this thread: torch has no public way to ask
+    return not torch._C._len_torch_dispatch_stack() and not torch.jit.is_tracing()
 
 
 def on_array(plan: Bound, mask: Tensor | None) -> np.ndarray:

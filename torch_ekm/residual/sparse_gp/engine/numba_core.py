@@ -212,7 +212,7 @@ def changed(p, n, on, y, figures, errors):
                 wrong, size = wrong + errors[b, o] * errors[b, o], size + t * t
             level[0] += N.RATE * ((1.0 if figures[1, b] > N.LARGE else 0.0) - level[0])
             misled[0] += N.MISLED_RATE * ((1.0 if wrong > N.WORSE * size else 0.0) - misled[0])
-        vector_at(p[P.LEVELS], n % N.RING_SIZE * p[P.MODELS] + b, 1)[0] = level[0] if on[b] else np.inf
+        vector_at(p[P.LEVELS], n % N.RING_SIZE * p[P.MODELS] + b, 1)[0] = level[0] if on[b] else N.NO_SAMPLE
         alarm |= level[0] > N.ALARM or misled[0] > N.ALARM
     return alarm
 
