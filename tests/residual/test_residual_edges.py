@@ -288,6 +288,7 @@ def test_masks_may_be_lists_of_bools_only():
         (lambda: MixtureResidual([]), "learners"),
         (lambda: MixtureResidual([ZeroResidual(2, 1), ZeroResidual(2, 2)]), "same"),
         (lambda: MixtureResidual([ZeroResidual(2, 1)] * 2), "twice"),
+        (lambda: MixtureResidual(ZeroResidual(2, 1), batch_shape=(2,)), "batch_shape"),
         *(
             (lambda bad=bad: MixtureResidual(ZeroResidual(1, 1), levels=bad), "levels")
             for bad in ((), (1.5,), (-0.1,))

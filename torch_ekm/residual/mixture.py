@@ -87,6 +87,9 @@ class MixtureResidual(ResidualLearner):
         first = _same_shapes(members)
         shape = {"batch_shape": tuple(first.batch_shape), "dtype": first.dtype, "device": first.device}
         super().__init__(first.in_features, first.out_features, **{**shape, **options})
+        if self.batch_shape != shape["batch_shape"]:
+            valid = f"{shape['batch_shape']}, as that of the learners"
+            raise ParameterError("batch_shape", tuple(self.batch_shape), valid)
         for name, values in (("levels", levels), ("trends", trends)):
             if not values or not all(0 <= value <= 1 for value in values):
                 raise ParameterError(name, values, "one or more numbers in [0, 1]")
