@@ -13,12 +13,14 @@ from typer.testing import CliRunner
 from torch_ekm.cli import app
 from torch_ekm.exceptions import DescriptionError, ParameterError, ShapeError, UnknownNameError
 from torch_ekm.experiments import Columns, compare, load_own
+from torch_ekm.experiments.learner_comparison.plots import plot_scores
 from torch_ekm.experiments.learner_comparison.prequential import run_prequential
 from torch_ekm.experiments.learner_comparison.recordings import load_recording
 from torch_ekm.experiments.learner_comparison.run import run_one
 from torch_ekm.experiments.learner_comparison.stream import Stream, load_table
 from torch_ekm.experiments.learner_comparison.table_file import open_table
 from torch_ekm.experiments.learners import learner_factory
+from torch_ekm.experiments.reporting.plots import COLOURS
 from torch_ekm.residual import UpdateReport, ZeroResidual
 
 
@@ -373,6 +375,14 @@ def test_command_prints_and_writes_what_the_function_returns(tmp_path: Path) -> 
     written = (out / "scores_mine.csv").read_text().splitlines()[1:]
     for line, score in zip(written, direct.row("mine"), strict=True):
         assert line.split(",")[1].strip('"').startswith(f"{score.rms.mean:.3f} [")
+
+
+def test_sparse_online_gps_are_blue_whatever_they_are_called(tmp_path: Path) -> None:
+    made = {"deep SOGP 5": learner_factory("SOGP plain"), "RLS": learner_factory("linear RLS")}
+    found = compare(write(tmp_path / "a.csv", table()), made)
+    lines = plot_scores(found).axes[0].lines[::2]
+    drawn = {name: line.get_color() for name, line in zip(found.learners, lines, strict=False)}
+    assert drawn["deep SOGP 5"] == COLOURS["E-KM"] != drawn["RLS"]
 
 
 def test_a_simulated_hand_makes_a_stream() -> None:

@@ -68,8 +68,6 @@ LEARNERS: dict[str, Factory] = {
     "SOGP mixture": _mixture,
     "river forest": interop.RiverResidual,
 }
-#: The default learner, and the sparse online GP in its forms.
-OURS = ("default", *(name for name in LEARNERS if name.startswith("SOGP")))
 #: What a comparison takes if nobody says otherwise: not those of other libraries, which are slow.
 COMPARED = tuple(name for name in LEARNERS if name != "river forest")
 

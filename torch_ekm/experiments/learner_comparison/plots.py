@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..learners import OURS
 from ..reporting.plots import COLOURS, new_figure
 from .scores import Comparison
 
@@ -32,7 +31,7 @@ def plot_scores(comparison: Comparison) -> Figure:
         scores, best = comparison.row(stream.name), comparison.best(stream.name)
         errors = [comparison.error(stream.name, score.learner) for score in scores]
         for i, (score, error) in enumerate(zip(scores, errors, strict=True)):
-            colour = _BLUE if score.learner in OURS else _GREY
+            colour = _BLUE if score.learner == "default" or "SOGP" in score.learner else _GREY
             axis.plot([error.low, error.high], [i, i], color=colour, linewidth=1.6)
             filled = colour if score is best else "white"
             axis.plot(error.mean, i, "o", color=colour, markerfacecolor=filled, markersize=5.5)
