@@ -54,7 +54,7 @@ LEARNERS = {
 
 
 def test_a_fleet_of_which_not_all_had_a_sample_comes_back(tmp_path: Path) -> None:
-    x = torch.rand(2, 3, dtype=torch.float64)
+    x = stream(2)[0]
     fleet = SparseOnlineGP(3, 1, batch_shape=(2,))
     fleet.update(x, x[:, :1], torch.tensor([True, False]))
     torch_ekm.save(fleet, tmp_path / "fleet")
@@ -202,32 +202,34 @@ def test_a_state_is_loaded_whole_or_not_at_all(name: str) -> None:
     assert torch.equal(learner(x), mean)
 
 
-FULL = torch.full_like
-
-
 @pytest.mark.parametrize(
-    ("name", "ends", "hostile", "said"),
+    ("name", "ends", "value", "said"),
     [
         # compiled loops write where counts lead
-        *(("sogp", f"posterior.{entry}", lambda t, n=n: FULL(t, n), "posterior") for entry, n in (
-            ("slot", 10**12), ("count", 9), ("count", 1), ("slot", 7), ("active", 1.0)
-        )),
+        ("sogp", "posterior.slot", 10**12, "posterior"),
+        ("sogp", "posterior.count", 9, "posterior"),
+        ("sogp", "posterior.count", 1, "posterior"),
+        ("sogp", "posterior.slot", 7, "posterior"),
+        ("sogp", "posterior.active", 1.0, "posterior"),
         # what is stated would be NaN, or turned round
-        *(("mixture", "output.scale", lambda t, n=n: FULL(t, n), "not above 0") for n in (0.0, -1.0)),
-        # factors of these matrices would be NaN
-        *((name, end, torch.neg, "in some direction") for name, end in (
-            ("sogp", "posterior.moments"), ("mixture", "1.information")
-        )),
+        ("mixture", "output.scale", 0.0, "scale is not above 0"),
+        ("mixture", "output.scale", -1.0, "scale is not above 0"),
+        # factors of these, with the other sign, would be NaN
+        ("sogp", "posterior.moments", None, "negative in some direction"),
+        ("mixture", "1.information", None, "negative in some direction"),
     ],
-)  # fmt: skip
-def test_a_state_to_which_no_stream_leads_is_refused(name, ends, hostile, said) -> None:
+)
+def test_a_state_to_which_no_stream_leads_is_refused(name, ends, value, said) -> None:
     x, y = stream()
     learner, other = LEARNERS[name](), LEARNERS[name]()
     other.update(x[:4], y[:4])
     state = other.state_dict()
-    for entry in [key for key in state if key.endswith(ends)]:
+    entries = [key for key in state if key.endswith(ends)]
+    assert entries
+    for entry in entries:
+        hostile = -state[entry] if value is None else torch.full_like(state[entry], value)
         with pytest.raises(exceptions.StateMismatchError, match=said):
-            learner.load_state_dict({**state, entry: hostile(state[entry])})
+            learner.load_state_dict({**state, entry: hostile})
     assert not learner(x).any()
 
 

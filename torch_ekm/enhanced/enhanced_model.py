@@ -403,10 +403,11 @@ def save(learner: ResidualLearner | EnhancedModel, path: str | os.PathLike) -> N
         raise NoStateError(type(learner).__name__, "it is neither a ResidualLearner nor an EnhancedModel")
     described = describe(learner)
     with (learner.learner if isinstance(learner, EnhancedModel) else learner).lock:
-        state = copy.deepcopy(learner.state_dict())  # of one moment, whoever learns meanwhile
-    if isinstance(learner, EnhancedModel):
-        described["arguments"].pop("model")
-        state = {name: one for name, one in state.items() if not name.startswith("model.")}
+        state = learner.state_dict()
+        if isinstance(learner, EnhancedModel):
+            described["arguments"].pop("model")
+            state = {name: one for name, one in state.items() if not name.startswith("model.")}
+        state = copy.deepcopy(state)  # of one moment, whoever learns meanwhile
     write(path, described, state)
 
 

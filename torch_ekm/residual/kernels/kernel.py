@@ -129,10 +129,11 @@ def check_kernel(kernel: Kernel, in_features: int, batch_shape: tuple[int, ...])
     kernel = copy.deepcopy(kernel)
     theta, fleet = list(kernel.hyperparameters().values()), tuple(batch_shape)
     try:
-        if _shape_of(kernel, in_features) == ():
+        shape = _shape_of(kernel, in_features)
+        if fleet and shape == ():
             for one in theta:
-                one.data = one.expand((*fleet, *one.shape)).contiguous()
-        shape = _shape_of(kernel, in_features) if theta else fleet
+                one.data = one.expand(*fleet, *one.shape).contiguous()
+            shape = _shape_of(kernel, in_features) if theta else fleet
     except RuntimeError:
         raise ParameterError("kernel", repr(kernel), valid) from None
     if shape != fleet or any(one.shape[: len(fleet)] != fleet for one in theta):
